@@ -1,0 +1,1 @@
+"""Figures against the papers and the peers: python -m benchmarks.NAME [--quick] [--json]."""

@@ -1,0 +1,1 @@
+"""Scenes to learn from: simulated, or read from files."""

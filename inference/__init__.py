@@ -1,0 +1,1 @@
+"""How to learn about the world: engines, none of which knows a concrete model."""

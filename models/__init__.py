@@ -1,0 +1,1 @@
+"""What the world is like: generative programs and their mathematics."""

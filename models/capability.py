@@ -1,0 +1,107 @@
+"""Named capabilities a model may offer, so that more engines can run on it.
+
+    moves()            involutions for reversible jump
+    start(evidence)    a data-driven first state, {site: (*event)}
+    kernel(evidence)   a compiled density over a packed state
+    dimension          name of the site that counts the active slots
+
+A move is an involution on (state, auxiliary numbers): (z, u) -> (z', u') and back, with u uniform
+on the unit cube. Choices are recycled: u = (k + r) / n picks k of n and keeps r. Then one number,
+the Jacobian of the whole map on the cube, is the complete proposal ratio (Green 1995, eq. 7):
+
+    log |d(z', u') / d(z, u)| = log_backward - log_forward + log_jacobian
+
+Moves report the three parts, because the papers' acceptance rules treat them differently: log q of
+the step and of its reverse in natural units [rad, m], and the Jacobian of the deterministic map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from torch import Tensor
+
+from models.program import Latents
+
+
+class Proposal(NamedTuple):
+    """Where a move leads, batched over chains.
+
+    latents       z', {site: (B, *event)}
+    uniforms      u', (B, U): the numbers that carry z' back to z
+    log_forward   (B,) log q(z -> z'), the choice of the move excluded
+    log_backward  (B,) log q(z' -> z)
+    log_jacobian  (B,) of the map in natural units
+    valid         (B,) False where the step leaves the state space
+    """
+
+    latents: Latents
+    uniforms: Tensor
+    log_forward: Tensor
+    log_backward: Tensor
+    log_jacobian: Tensor
+    valid: Tensor
+
+
+class Move(NamedTuple):
+    """One kind of step: how often it is tried, how many uniform numbers it uses, the involution."""
+
+    name: str
+    probability: float
+    num_uniforms: int
+    propose: Callable[[Latents, Tensor], Proposal]
+
+
+class HasMoves(Protocol):
+    """A program that reversible jump can run on."""
+
+    def __call__(self, evidence: Any) -> None: ...
+
+    def moves(self) -> tuple[Move, ...]: ...
+
+
+class Kernel(NamedTuple):
+    """A compiled density over packed states, for engines that run whole chains in machine code.
+
+    The functions are numba functions with the signatures of `kernel_types`, so that the compiled
+    chain is shared by all models and kept in the disk cache. `floats` and `ints` hold the data.
+
+    propose(kind, z, u, floats, ints, z_new, u_new, log_q) -> valid
+        the involution of the model's moves; log_q = (forward, backward, jacobian)
+    evaluate(z, floats, ints, cache, out)
+        out = (log prior, log likelihood); may reuse what the cache holds of the current state
+    commit(cache)
+        the state evaluated last becomes the current one
+    """
+
+    move_names: tuple[str, ...]
+    probabilities: np.ndarray  # (M,) of the moves
+    num_uniforms: int
+    size: int  # length of a packed state
+    floats: np.ndarray
+    ints: np.ndarray
+    cache_size: int
+    propose: Any
+    evaluate: Any
+    commit: Any
+    pack: Callable[[dict[str, Any]], np.ndarray]  # {site: (B, *event)} -> (B, size)
+    unpack: Callable[[np.ndarray], dict[str, np.ndarray]]  # (*batch, size) -> {site: (*batch, *event)}
+    improve: Callable[..., Any] | None = None
+
+
+def kernel_types() -> dict[str, Any]:
+    """The explicit numba types of a kernel's functions: with them a compiled chain that takes the
+    functions as arguments is found again in the disk cache."""
+    from numba import boolean, float64, int64, types, void
+
+    vector, index = float64[::1], int64[::1]
+    return {
+        "propose": boolean(int64, vector, vector, vector, index, vector, vector, vector),
+        "evaluate": void(vector, vector, index, vector, vector),
+        "commit": void(vector),
+        "vector": vector,
+        "index": index,
+        "function": types.FunctionType,
+    }

@@ -1,0 +1,1 @@
+"""Lane-level intersections (Meyer, Walter, Lauer 2020)."""

@@ -1,0 +1,1 @@
+"""The first examples: small models with exact answers."""

@@ -88,7 +88,7 @@ class _Whitened(Messenger):
 
 
 @contextmanager
-def _quiet_doubles() -> Iterator[None]:
+def quiet_doubles() -> Iterator[None]:
     """Run a program in float64, without Pyro's own validation, leaving no trace of either."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
@@ -101,7 +101,7 @@ def _quiet_doubles() -> Iterator[None]:
 
 def _sites(model: Model, evidence: Any, handler: Messenger) -> dict[str, Site]:
     """Run the program under a handler; its sample sites by name."""
-    with _quiet_doubles(), handler:
+    with quiet_doubles(), handler:
         trace = poutine.trace(model).get_trace(evidence)
     return {
         name: site
@@ -169,7 +169,7 @@ def simulate(model: Model, evidence: Any, *, num: int, seed: int) -> Latents:
     """Draw every unobserved site `num` times from the program, {site: (num, *event)}.
 
     Sites whose evidence field is None are drawn too. Randomness is local to the call."""
-    with torch.random.fork_rng(devices=[]), _quiet_doubles():
+    with torch.random.fork_rng(devices=[]), quiet_doubles():
         torch.manual_seed(seed)
         once = poutine.trace(model).get_trace(evidence)
         with pyro.plate("_batch", num, dim=-1 - _plate_dims(once.nodes)):
@@ -405,7 +405,7 @@ def bind(model: Model, evidence: Any) -> Bound:
     """Bind a model to its evidence as a flat whitened density.
 
     Raises InputError by name for a latent that no map of normal numbers reaches."""
-    with torch.random.fork_rng(devices=[]), _quiet_doubles():
+    with torch.random.fork_rng(devices=[]), quiet_doubles():
         torch.manual_seed(0)
         nodes = poutine.trace(model).get_trace(evidence).nodes
     shapes, pads, plate_dims = {}, {}, _plate_dims(nodes)

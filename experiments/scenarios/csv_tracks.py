@@ -1,0 +1,211 @@
+"""Tracks of real vehicles from a table: read with care, then made even along their path.
+
+One row a vehicle and time step, columns in any order: vehicle, t [s], x, y [m], and, where
+measured, heading [rad]; `recording` where vehicle numbers repeat between recordings. Other columns are
+ignored.
+"""
+
+from __future__ import annotations
+
+import csv as table
+import gzip
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from experiments.scenarios import paths
+from experiments.scenarios.scene import Floats, Scene, join_tracks
+from models.intersection.tracks import Tracks
+from models.program import InputError
+
+REQUIRED = ("vehicle", "t", "x", "y")
+MIN_LENGTH = 30.0  # shorter tracks mislead more than they tell: findings on recorded traffic [m]
+STEP = 1.0  # between points, [M20] section V [m]
+STOPPED = 0.5  # steps shorter than this are standing and its jitter [m]
+SMOOTHING = 1.5  # standard deviation of the Gaussian window along the path [m]
+
+
+class Recorded(NamedTuple):
+    """One vehicle as recorded.
+
+    vehicle  as messages name it
+    row      of its first entry in the file
+    points   (n, 2) [m]
+    heading  (n,) [rad], None where not measured
+    """
+
+    vehicle: str
+    row: int
+    points: Floats
+    heading: Floats | None
+
+
+def csv(path: str, min_length: float = MIN_LENGTH) -> Scene:
+    """Any user's tracks from a .csv or .csv.gz file.
+
+    min_length  tracks shorter than this are left out [m]
+
+    Coordinates stay as given. Raises InputError with file, row, column, value and remedy for
+    whatever cannot be read, and where no vehicle crosses anything."""
+    vehicles = read(path)
+    pieces = [even(vehicle) for vehicle in vehicles]
+    lengths = [paths.arc_length(points)[-1] for points, _ in pieces]
+    long = [piece for piece, length in zip(pieces, lengths, strict=True) if length >= min_length]
+    if not long:
+        raise InputError(
+            f"{path}: no vehicle crosses a junction, the longest of {len(vehicles)} tracks is {max(lengths):.1f} m "
+            f"and min_length is {min_length:g} m; give longer tracks or lower scenario.min_length"
+        )
+    data = join(long)
+    info = {
+        "scenario": "csv",
+        "path": str(path),
+        "vehicles": len(vehicles),
+        "tracks": len(long),
+        "points": len(data.points),
+        "heading": "none" if data.heading is None else "measured",
+    }
+    return Scene(data, None, Path(path).name, info)
+
+
+def join(pieces: list[tuple[Floats, Floats | None]]) -> Tracks:
+    """Single tracks with or without headings behind one another."""
+    headings = [heading for _, heading in pieces if heading is not None]
+    return join_tracks([points for points, _ in pieces], headings or None)
+
+
+# Along the path
+
+
+def even(vehicle: Recorded) -> tuple[Floats, Floats | None]:
+    """A track with a point every metre: stops removed, jitter smoothed along the path.
+
+    Points closer than half a metre to the last kept one are standing or its jitter and go. The rest
+    is interpolated and averaged by a Gaussian window of 1.5 m over the arc length, headings as
+    directions. Returns points (n, 2) and headings (n,); a single point where the vehicle never moved."""
+    kept = [0]
+    for i in range(1, len(vehicle.points)):
+        if math.dist(vehicle.points[i], vehicle.points[kept[-1]]) >= STOPPED:
+            kept.append(i)
+    points = vehicle.points[kept]
+    along = paths.arc_length(points)
+    s = np.arange(0.0, along[-1] + 1e-9, STEP)
+    smooth = _smooth(paths.at(points, s), mirror="odd")
+    if vehicle.heading is None:
+        return smooth, None
+    direction = np.stack([np.cos(vehicle.heading[kept]), np.sin(vehicle.heading[kept])], axis=1)
+    even_direction = np.stack([np.interp(s, along, column) for column in direction.T], axis=1)
+    return smooth, np.arctan2(*_smooth(even_direction, mirror="even").T[::-1])
+
+
+def _smooth(values: Floats, mirror: Literal["odd", "even"]) -> Floats:
+    """Gaussian window along (n, 2); mirrored at the ends, through the end point (odd) or not (even)."""
+    reach = math.ceil(3 * SMOOTHING / STEP)
+    window = np.exp(-0.5 * (np.arange(-reach, reach + 1) * STEP / SMOOTHING) ** 2)
+    padded = np.pad(values, ((reach, reach), (0, 0)), mode="reflect", reflect_type=mirror)
+    return np.stack([np.convolve(column, window / window.sum(), "valid") for column in padded.T], axis=1)
+
+
+# The table
+
+
+def read(path: str | Path, types: tuple[str, ...] | None = None) -> list[Recorded]:
+    """Vehicles of a table in the order they appear; `types` keeps rows whose column `type` is one of these.
+
+    Raises InputError for a file that is missing, empty or no table, for missing columns, for values
+    that are no numbers, for times that do not increase within a vehicle, for degrees instead of metres
+    or radians and where every vehicle has a single point."""
+    rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    first: dict[tuple[str, str], int] = {}
+    has_heading = False
+    for number, row in _rows(Path(path)):
+        has_heading = "heading" in row
+        if types is not None and row["type"] not in types:
+            continue
+        key = (row.get("recording", ""), row["vehicle"])
+        where = f"{path}, row {number}, vehicle {row['vehicle']}"
+        columns = ("t", "x", "y", "heading") if has_heading else ("t", "x", "y")
+        values = tuple(_number(where, column, row[column]) for column in columns)
+        before = rows.setdefault(key, [])
+        _check_row(where, values, before)
+        before.append(values)
+        first.setdefault(key, number)
+    if not rows:
+        raise InputError(f"{path}: the table has no rows; give one row for each vehicle and time step")
+    vehicles = []
+    for key, entries in rows.items():
+        array = np.array(entries)
+        heading = array[:, 3] if has_heading else None
+        vehicles.append(Recorded(key[1], first[key], array[:, 1:3], heading))
+    _check_all(path, vehicles)
+    return vehicles
+
+
+def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """Rows of the file with their line numbers, the header being line 1."""
+    opener = gzip.open if path.suffix == ".gz" else open
+    try:
+        with opener(path, "rt", newline="", encoding="utf-8-sig") as file:
+            reader = table.DictReader(file, skipinitialspace=True)
+            header = reader.fieldnames or []
+            if not header:
+                raise InputError(f"{path}: the file is empty; give a table with the columns {', '.join(REQUIRED)}")
+            missing = [column for column in REQUIRED if column not in header]
+            if missing:
+                raise InputError(
+                    f"{path}: no column {' and no column '.join(missing)}, the header has {', '.join(header)}; "
+                    f"name the columns {', '.join(REQUIRED)} and, where measured, heading"
+                )
+            for row in reader:
+                yield reader.line_num, row
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; it was looked for at {path.resolve()}") from None
+    except (OSError, EOFError, UnicodeDecodeError, table.Error) as error:
+        raise InputError(f"{path}: this cannot be read as a table ({error}); give a .csv or .csv.gz file") from None
+
+
+def _number(where: str, column: str, text: str | None) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{where}: {column} is '{text or ''}', not a number; correct the value or remove the row")
+    return value
+
+
+def _check_row(where: str, values: tuple[float, ...], before: list[tuple[float, ...]]) -> None:
+    """Times increase within a vehicle, headings are radians."""
+    t = values[0]
+    if before and t == before[-1][0]:
+        raise InputError(
+            f"{where}: t = {t:g} comes twice; keep one row for each vehicle and time, "
+            "or tell recordings apart by a column 'recording'"
+        )
+    if before and t < before[-1][0]:
+        raise InputError(f"{where}: t = {t:g} comes after t = {before[-1][0]:g}; sort the rows of each vehicle by time")
+    if len(values) == 4 and abs(values[3]) > 2 * math.pi + 1e-2:
+        raise InputError(
+            f"{where}: heading is {values[3]:g}, beyond 2 pi; "
+            "give radians (degrees times pi / 180) or remove the column"
+        )
+
+
+def _check_all(path: str | Path, vehicles: list[Recorded]) -> None:
+    """Vehicles move, and in metres."""
+    if all(len(vehicle.points) == 1 for vehicle in vehicles):
+        raise InputError(
+            f"{path}: each of the {len(vehicles)} vehicles has a single point, the first is vehicle "
+            f"{vehicles[0].vehicle} in row {vehicles[0].row}; give the same number to all rows of a vehicle"
+        )
+    points = np.concatenate([vehicle.points for vehicle in vehicles])
+    extent = np.ptp(points, axis=0)
+    if (np.abs(points) <= (180.0, 90.0)).all() and (extent < 0.1).all():
+        x, y = points[0]
+        raise InputError(
+            f"{path}, row {vehicles[0].row}: x = {x:g} and y = {y:g} span only {extent[0]:.2g} and {extent[1]:.2g}, "
+            "which looks like degrees of longitude and latitude; project them to metres, for example to UTM"
+        )

@@ -1,0 +1,1 @@
+"""Tests; the checks shared by several files are modules here (tests.involution)."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -165,7 +166,7 @@ def _is_minimum(state: State, tolerance: float) -> bool:
 
 
 def _check_continuation(continuation: Sequence[float]) -> None:
-    falling = all(a > b for a, b in zip(continuation, continuation[1:], strict=False))
+    falling = all(a > b for a, b in pairwise(continuation))
     if not continuation or not falling or continuation[-1] != 1.0:
         raise InputError(
             f"continuation must hold falling inflations of the noise that end in 1, but it is {list(continuation)}"

@@ -104,9 +104,7 @@ def _sites(model: Model, evidence: Any, handler: Messenger) -> dict[str, Site]:
     with quiet_doubles(), handler:
         trace = poutine.trace(model).get_trace(evidence)
     return {
-        name: site
-        for name, site in trace.nodes.items()
-        if site["type"] == "sample" and not site_is_subsample(site)
+        name: site for name, site in trace.nodes.items() if site["type"] == "sample" and not site_is_subsample(site)
     }
 
 
@@ -374,9 +372,7 @@ class Bound:
         """log N(x; 0, I) + log p(y | T(x)), (*batch)."""
         sites = self._run(x)
         plates = _plate_dims(sites)
-        likelihood = {
-            n: _sum_plates(_site_log_prob(n, s), plates) for n, s in sites.items() if _is_evidence(s)
-        }
+        likelihood = {n: _sum_plates(_site_log_prob(n, s), plates) for n, s in sites.items() if _is_evidence(s)}
         return -0.5 * (x.square() + math.log(2 * math.pi)).sum(-1) + total(likelihood)
 
     def residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ class Readings(NamedTuple):
 class ConjugateGaussian:
     """A line read with Gaussian noise.
 
-        beta ~ N(0, diag(prior_std^2)),   y_n ~ N(beta_0 + beta_1 t_n, noise_std^2)
+    beta ~ N(0, diag(prior_std^2)),   y_n ~ N(beta_0 + beta_1 t_n, noise_std^2)
     """
 
     prior_std: tuple[float, float] = (2.0, 1.0)

@@ -144,9 +144,7 @@ class SlotRoad:
                 values[rows[birth], last[birth]],
             )
 
-        back = torch.stack(
-            [(u[:, 0] + 0.5) % 1.0, u[:, 1], old_knot / self.length, normal.cdf(old_rate)], 1
-        )
+        back = torch.stack([(u[:, 0] + 0.5) % 1.0, u[:, 1], old_knot / self.length, normal.cdf(old_rate)], 1)
         log_forward = normal.log_prob(new_rate) - math.log(self.length)
         log_backward = normal.log_prob(old_rate) - math.log(self.length)
         new = z | {"num_knots": torch.where(valid, count + 2 * birth.long() - 1, count), "knot": knot, "rate": rate}

@@ -1,0 +1,216 @@
+"""Log likelihood of half tracks given the lanes of an intersection, in machine code.
+
+One arm's row holds, for every half track, the cost of belonging to that arm; the rows of all arms
+together make the likelihood. `exact` sums over the unknown lane labels,
+
+    log p(half) = log( (1 - clutter) / L  sum_arm sum_lane exp(-cost) + clutter p_0(half) )
+
+`half` and `point` keep the closest lane only, as [M20] section III-B does, and add the multinomial
+coefficient of the track counts per lane: log T! - sum_l log n_l! - T log L. They are scores, not
+normalised densities. `point` associates every point by itself, as printed; `half` every half track.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+
+from models.intersection.moments import (
+    A0,
+    A_K,
+    A_KK,
+    A_KX,
+    A_KY,
+    A_X,
+    A_XX,
+    A_XY,
+    A_Y,
+    A_YY,
+    CHORD,
+    PHI,
+    W_ACROSS,
+    W_ALONG,
+    W_HEADING,
+    S,
+    T,
+    X,
+    Y,
+)
+
+EXACT, HALF, POINT = 0, 1, 2
+LIKELIHOODS = {"exact": EXACT, "half": HALF, "point": POINT}
+NEGLIGIBLE = 37.0  # exp(-37) is below the resolution of a double next to 1
+NO_LANE = 1e18  # cost where an arm has no lane of the driving direction
+FAST = {"reassoc", "contract", "arcp", "nsz"}
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def scatter_row(coef, angle, bend, out):  # type: ignore[no-untyped-def]
+    """Cost of the scatter of every half track around lanes of this direction and bend, (H,)."""
+    dx, dy = math.cos(angle), math.sin(angle)
+    xx, yy, xy = dx * dx, dy * dy, dx * dy
+    kx, ky, kk = bend * dx, bend * dy, bend * bend
+    for h in range(coef.shape[1]):
+        straight = coef[A0, h] + xx * coef[A_XX, h] + yy * coef[A_YY, h] + xy * coef[A_XY, h]
+        straight += dx * coef[A_X, h] + dy * coef[A_Y, h]
+        out[h] = straight + ky * coef[A_KY, h] - kx * coef[A_KX, h] + bend * coef[A_K, h] + kk * coef[A_KK, h]
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def mean_row(coef, first, last, side, cx, cy, arm, scatter, cost, lane):  # type: ignore[no-untyped-def]
+    """Add the cost of the mean residuals to the closest lane, halves first:last of one side.
+
+    arm = (angle, gap, entries, exits, width, bend, shift); side +1 entries, -1 exits.
+    cost, lane  (H,) filled between first and last"""
+    angle, gap, width, bend, shift = arm[0], arm[1], arm[4], arm[5], arm[6]
+    num = arm[2] if side > 0 else arm[3]
+    dx, dy = math.cos(angle), math.sin(angle)
+    axis = -dy * cx + dx * cy + shift
+    along = dx * cx + dy * cy
+    inner = 0.5 * gap + 0.5 * width
+    heading = angle + (math.pi if side > 0 else 0.0) - 0.5 * CHORD * bend
+    top, per_width, turn = num - 1.0, 1.0 / width, 1.0 / (2.0 * math.pi)
+    for h in range(first, last):
+        across = -dy * coef[X, h] + dx * coef[Y, h] - axis - bend * coef[T, h]
+        e = side * across - inner
+        k = min(max(math.floor(e * per_width + 0.5), 0.0), top)
+        r = e - k * width
+        v = dx * coef[X, h] + dy * coef[Y, h] - along - coef[S, h]
+        p = coef[PHI, h] - heading - bend * coef[S, h]
+        p -= 2.0 * math.pi * math.floor(p * turn + 0.5)
+        mean = coef[W_ACROSS, h] * r * r + coef[W_ALONG, h] * v * v + coef[W_HEADING, h] * p * p
+        cost[h] = scatter[h] + 0.5 * mean
+        lane[h] = k
+
+
+@nb.njit(cache=True, error_model="numpy")
+def sum_lanes_row(coef, first, last, side, cx, cy, arm, cost, lane):  # type: ignore[no-untyped-def]
+    """Turn the cost of the closest lane into -log sum over the arm's lanes of exp(-cost)."""
+    width, num = arm[4], int(arm[2] if side > 0 else arm[3])
+    if num < 2:
+        return
+    dx, dy = math.cos(arm[0]), math.sin(arm[0])
+    axis = -dy * cx + dx * cy + arm[6]
+    inner = 0.5 * arm[1] + 0.5 * width
+    for h in range(first, last):
+        k = int(lane[h])
+        across = -dy * coef[X, h] + dx * coef[Y, h] - axis - arm[5] * coef[T, h]
+        r = side * across - inner - k * width
+        half_weight = 0.5 * coef[W_ACROSS, h] * width
+        extra = 0.0
+        for step in (-1, 1):
+            j = 1
+            while 0 <= k + step * j < num:
+                more = half_weight * j * (j * width - 2.0 * step * r)
+                if more > NEGLIGIBLE:
+                    break
+                extra += math.exp(-more)
+                j += 1
+        if extra > 0.0:
+            cost[h] -= math.log1p(extra)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def sum_arms(rows, pick, num_arms, first, last, num_lanes, clutter, log_clutter, log_kept):  # type: ignore[no-untyped-def]
+    """Log likelihood of halves first:last of one side, labels summed out.
+
+    rows         (2, A, H) cost per arm, lanes summed; rows[pick[a], a] is the one that counts
+    num_lanes    lanes of this side on all arms
+    clutter      (H,) -log p_0 minus the Gaussian normaliser of the half
+    log_clutter  log of the share of clutter, log_kept of the rest"""
+    if last == first:
+        return 0.0
+    if num_lanes < 0.5:
+        return -math.inf
+    label = log_kept - math.log(num_lanes)
+    total = 0.0
+    for h in range(first, last):
+        low, second = NO_LANE, NO_LANE
+        for a in range(num_arms):
+            value = rows[int(pick[a]), a, h]
+            if value < low:
+                low, second = value, low
+            elif value < second:
+                second = value
+        low -= label
+        second -= label
+        stray = clutter[h] - log_clutter
+        best = min(low, stray)
+        if max(low, stray) - best > NEGLIGIBLE and second - best > NEGLIGIBLE:
+            total -= best
+            continue
+        share = math.exp(best - stray)
+        for a in range(num_arms):
+            share += math.exp(best - (rows[int(pick[a]), a, h] - label))
+        total += math.log(share) - best
+    return total
+
+
+@nb.njit(cache=True, error_model="numpy")
+def closest_arms(rows, lanes, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
+    """Score of halves first:last of one side with the closest lane each and multinomial counts."""
+    if last == first:
+        return 0.0
+    if num_lanes < 0.5:
+        return -math.inf
+    counts[:] = 0.0
+    total = 0.0
+    for h in range(first, last):
+        low, arm = math.inf, 0
+        for a in range(num_arms):
+            value = rows[int(pick[a]), a, h]
+            if value < low:
+                low, arm = value, a
+        total -= low
+        counts[arm, int(lanes[int(pick[arm]), arm, h])] += 1.0
+    return total + multinomial(counts, num_lanes)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def multinomial(counts, num_lanes):  # type: ignore[no-untyped-def]
+    """log T! - sum log n! - T log L of the track counts per lane."""
+    tracks, total = 0.0, 0.0
+    for count in counts.flat:
+        tracks += count
+        if count > 1.0:
+            total -= math.lgamma(count + 1.0)
+    return total + math.lgamma(tracks + 1.0) - tracks * math.log(num_lanes)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def closest_points(points, begin, end, first, last, side, cx, cy, arms, num_arms, num_lanes, noise, counts):  # type: ignore[no-untyped-def]
+    """Score of halves first:last of one side, every point with its closest lane ([M20] III-B).
+
+    Half h holds points begin[h]:end[h], rows (x, y, heading); noise = (position, heading) deviations.
+    A half counts for the lane that is closest to most of its points."""
+    if last == first:
+        return 0.0
+    if num_lanes < 0.5:
+        return -math.inf
+    counts[:] = 0.0
+    votes = counts.copy()
+    total = 0.0
+    for h in range(first, last):
+        votes[:] = 0.0
+        for i in range(begin[h], end[h]):
+            low, arm, lane = math.inf, 0, 0
+            for a in range(num_arms):
+                num = arms[a, 2] if side > 0 else arms[a, 3]
+                if num < 0.5:
+                    continue
+                angle, gap, width = arms[a, 0], arms[a, 1], arms[a, 4]
+                across = -math.sin(angle) * (points[0, i] - cx) + math.cos(angle) * (points[1, i] - cy) - arms[a, 6]
+                e = side * across - 0.5 * gap - 0.5 * width
+                k = min(max(math.floor(e / width + 0.5), 0.0), num - 1.0)
+                r = (e - k * width) / noise[0]
+                p = points[2, i] - angle - (math.pi if side > 0 else 0.0)
+                p = (p - 2.0 * math.pi * math.floor(p / (2.0 * math.pi) + 0.5)) / noise[1]
+                cost = 0.5 * (r * r + p * p)
+                if cost < low:
+                    low, arm, lane = cost, a, int(k)
+            total -= low
+            votes[arm, lane] += 1.0
+        most = votes.argmax()
+        counts[most // counts.shape[1], most % counts.shape[1]] += 1.0
+    return total + multinomial(counts, num_lanes)

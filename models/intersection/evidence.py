@@ -1,0 +1,98 @@
+"""What the intersection program reads: half tracks with their fixed positions along the lane."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from models.intersection import halves as hv
+from models.intersection.moments import NUM_COEFFICIENTS, along_moments, coefficients, moments
+from models.intersection.tracks import Tracks
+from models.program import InputError
+
+if TYPE_CHECKING:
+    from models.intersection.state import Junction
+
+Array = NDArray[np.float64]
+MIN_POINTS = 8  # of a half track
+
+
+class JunctionEvidence(NamedTuple):
+    """Half tracks, entries first.
+
+    points   (3, N) x, y about the origin [m] and heading [rad], half by half; None simulates
+    s        (N,) distance from the origin along the lane [m]: a fixed covariate
+    starts   (H + 1,) half h holds points starts[h]:starts[h + 1]
+    entries  number of entry halves
+    origin   (2,) where the tracks meet [m]
+    heading  whether headings were measured
+    moments  (12, H) of the points; None where they are simulated
+    whole    the tracks as given, about the origin: [M20]'s likelihoods split them at the latent centre
+    """
+
+    points: Tensor | None
+    s: Array
+    starts: NDArray[np.int64]
+    entries: int
+    origin: Array
+    heading: bool
+    moments: Array | None
+    whole: Tracks | None
+
+    @property
+    def num_halves(self) -> int:
+        return len(self.starts) - 1
+
+
+def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
+    """Split tracks into halves outside the inner radius about where they meet.
+
+    Raises InputError where no track is long enough or none crosses."""
+    offsets = np.ascontiguousarray(tracks.offsets, dtype=np.int64)
+    points = np.ascontiguousarray(tracks.points, dtype=np.float64)
+    if len(offsets) < 2 or not np.isfinite(points).all():
+        raise InputError(f"tracks must be finite points of at least one vehicle; got {len(offsets) - 1} vehicles")
+    path = hv.smooth(points, offsets)
+    origin = hv.crossing(path, offsets)
+    measured = tracks.heading is not None
+    phi = hv.unwrap(np.asarray(tracks.heading), offsets) if measured else hv.path_headings(path, offsets)
+    begin, end, entries = hv.outer_halves(path, offsets, origin, model.inner_radius, MIN_POINTS)
+    if len(begin) == 0:
+        raise InputError(
+            f"none of the {len(offsets) - 1} tracks has {MIN_POINTS} points outside {model.inner_radius:g} m and "
+            f"one inside of where they meet ({origin[0]:.1f}, {origin[1]:.1f}); give tracks that cross the junction"
+        )
+    observed, s, starts = hv.gather_halves(points, path, phi, begin, end, entries, origin)
+    whole = Tracks(points - origin, phi, offsets) if model.likelihood != "exact" else None
+    known = moments(observed[0], observed[1], observed[2], s, starts)
+    return JunctionEvidence(torch.from_numpy(observed), s, starts, int(entries), origin, measured, known, whole)
+
+
+def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Array:
+    """Coefficients of the density, (18, H), from moments (12, H)."""
+    noise = model.noise
+    out = np.empty((NUM_COEFFICIENTS, observed.shape[1]))
+    heading = noise.heading if evidence.heading else math.inf
+    along = along_moments(evidence.s, evidence.starts)
+    coefficients(observed, along, noise.position, noise.along, noise.offset, noise.phase, heading, out)
+    return out
+
+
+def clutter_costs(evidence: JunctionEvidence, model: Junction) -> tuple[Array, Array]:
+    """(H,) log normaliser of a half on a lane, and -log density of a stray half beyond it.
+
+    The points of a stray half are uniform in a disc, its headings on the circle."""
+    from models.intersection.moments import COUNT, log_normaliser
+
+    along = along_moments(evidence.s, evidence.starts)
+    noise = model.noise if evidence.heading else model.noise._replace(heading=math.inf)
+    front = log_normaliser(along, noise)
+    stray = along[COUNT] * math.log(math.pi * model.clutter_radius**2)
+    if evidence.heading:
+        stray = stray + along[COUNT] * math.log(2 * math.pi)
+    return front, stray + front

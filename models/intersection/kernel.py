@@ -1,0 +1,293 @@
+"""The intersection as a compiled kernel: prior, likelihood with a memory of the arms, moves.
+
+The memory holds two rows per slot: the one of the current state and the one evaluated last. A row is
+found again by the numbers it was computed from, so `evaluate` is a function of z alone, whatever was
+evaluated before; `commit` decides which row to keep."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
+
+import numba as nb
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from models.capability import Kernel, Move, Proposal, kernel_types
+from models.intersection import density, moves
+from models.intersection.density import EXACT, HALF, LIKELIHOODS, POINT
+from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
+from models.intersection.halves import smooth
+from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS
+from models.intersection.packing import ARM, ENTRIES, EXITS, HEAD, MAX_ARMS, SIZE, pack, unpack
+from models.intersection.prior import log_prior
+from models.intersection.split import (
+    NUM_CELLS,
+    NUM_SUMS,
+    cell_coefficients,
+    cell_of,
+    half_ranges,
+    prefix_sums,
+    split_table,
+)
+
+if TYPE_CHECKING:
+    from models.intersection.state import Junction
+
+Array = NDArray[np.float64]
+
+# numbers after the settings of prior and moves
+LOG_CLUTTER, LOG_KEPT, POSITION, HEADING, CONSTANT = range(moves.NUM_SETTINGS, moves.NUM_SETTINGS + 5)
+FLOATS = moves.NUM_SETTINGS + 5
+# whole numbers of the data
+LIKELIHOOD, NUM_HALVES, NUM_ENTRIES, NUM_TRACKS, MARGIN = range(5)
+INTS = 5
+KEY = 2 + ARM  # a row depends on the centre and on its arm
+TURN = 3  # its scatter on direction, bend and the split
+MAX_COUNTS = 10  # lanes of a side, at most
+
+
+@nb.njit(cache=True)
+def memory_size(ints):  # type: ignore[no-untyped-def]
+    """Length of the cache for this evidence."""
+    halves = ints[NUM_HALVES]
+    size = MAX_ARMS * (4 + 2 * KEY + 2 * TURN + 6 * halves + MAX_COUNTS)
+    if ints[LIKELIHOOD] == HALF:
+        size += NUM_CELLS + (NUM_MOMENTS + 5) * halves + NUM_CELLS * NUM_COEFFICIENTS * halves
+    return size
+
+
+@nb.njit(cache=True)
+def memory(cache, halves):  # type: ignore[no-untyped-def]
+    """Named views of the cache: which row of each slot is current and which is evaluated, for rows and for
+    their scatter; the numbers each was computed from; scatter, costs and lanes (2, A, H); counts; the rest."""
+    n = MAX_ARMS
+    which = cache[: 4 * n].reshape((4, n))
+    o = 4 * n
+    keys = cache[o : o + 2 * n * KEY].reshape((2, n, KEY))
+    o += 2 * n * KEY
+    turns = cache[o : o + 2 * n * TURN].reshape((2, n, TURN))
+    o += 2 * n * TURN
+    rows = cache[o : o + 6 * n * halves].reshape((3, 2, n, halves))
+    o += 6 * n * halves
+    counts = cache[o : o + n * MAX_COUNTS].reshape((n, MAX_COUNTS))
+    return which, keys, turns, rows, counts, cache[o + n * MAX_COUNTS :]
+
+
+@nb.njit(cache=True)
+def lanes_of(z, field):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for a in range(int(z[0])):
+        total += z[HEAD + a * ARM + field]
+    return total
+
+
+@nb.njit(cache=True)
+def coefficients_at(cell, floats, ints, room):  # type: ignore[no-untyped-def]
+    """[M20]'s halves for a cell of the centre, (18, 2 T); every cell is computed once."""
+    halves, tracks = ints[NUM_HALVES], ints[NUM_TRACKS]
+    known = room[:NUM_CELLS]
+    o = NUM_CELLS
+    observed = room[o : o + NUM_MOMENTS * halves].reshape((NUM_MOMENTS, halves))
+    o += NUM_MOMENTS * halves
+    fixed = room[o : o + 5 * halves].reshape((5, halves))
+    o += 5 * halves + cell * NUM_COEFFICIENTS * halves
+    coef = room[o : o + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
+    if known[cell] == 0.0:
+        offsets = ints[INTS : INTS + tracks + 1]
+        table = ints[INTS + tracks + 1 :]
+        begin, end = np.empty(halves, np.int64), np.empty(halves, np.int64)
+        half_ranges(table, offsets, cell, ints[MARGIN], begin, end)
+        num = offsets[tracks]
+        sums = floats[FLOATS + 3 * num : FLOATS + 3 * num + NUM_SUMS * (num + tracks)].reshape((num + tracks, NUM_SUMS))
+        cell_coefficients(sums, offsets, begin, end, floats[POSITION], floats[HEADING], observed, fixed, coef)
+        known[cell] = 1.0
+    return coef
+
+
+@nb.njit(cache=True)
+def point_score(z, floats, ints, counts):  # type: ignore[no-untyped-def]
+    """[M20] as printed: every point with its closest lane, halves split at the centre."""
+    tracks, halves = ints[NUM_TRACKS], ints[NUM_HALVES]
+    offsets, table = ints[INTS : INTS + tracks + 1], ints[INTS + tracks + 1 :]
+    begin, end = np.empty(halves, np.int64), np.empty(halves, np.int64)
+    half_ranges(table, offsets, cell_of(z[1], z[2]), ints[MARGIN], begin, end)
+    points = floats[FLOATS : FLOATS + 3 * offsets[tracks]].reshape((3, offsets[tracks]))
+    arms = z[HEAD:].reshape((MAX_ARMS, ARM))
+    noise, num = floats[POSITION : HEADING + 1], int(z[0])
+    entries, exits = lanes_of(z, ENTRIES), lanes_of(z, EXITS)
+    score = density.closest_points(points, begin, end, 0, tracks, 1.0, z[1], z[2], arms, num, entries, noise, counts)
+    return score + density.closest_points(
+        points, begin, end, tracks, halves, -1.0, z[1], z[2], arms, num, exits, noise, counts
+    )
+
+
+@nb.njit(cache=True)
+def fill_row(coef, entries, halves, side, cx, cy, arm, summed, scatter, row, lane):  # type: ignore[no-untyped-def]
+    """Costs of the halves of one side with one arm."""
+    first, last = (0, entries) if side > 0 else (entries, halves)
+    if (arm[2] if side > 0 else arm[3]) < 0.5:
+        row[first:last] = density.NO_LANE
+        return
+    density.mean_row(coef, first, last, side, cx, cy, arm, scatter, row, lane)
+    if summed:
+        density.sum_lanes_row(coef, first, last, side, cx, cy, arm, row, lane)
+
+
+@nb.njit(cache=True)
+def update_arm(a, z, coef, cell, ints, which, keys, turns, rows):  # type: ignore[no-untyped-def]
+    """Make sure that a slot's row for z is at hand, computing only what changed."""
+    arm = z[HEAD + a * ARM : HEAD + (a + 1) * ARM]
+    row = int(which[0, a])
+    known = keys[row, a, 0] == z[1] and keys[row, a, 1] == z[2]
+    for j in range(ARM):
+        known = known and keys[row, a, 2 + j] == arm[j]
+    which[1, a], which[3, a] = row, which[2, a]
+    if known:
+        return
+    row, turn = 1 - row, int(which[2, a])
+    halves, entries = ints[NUM_HALVES], ints[NUM_ENTRIES]
+    if not (turns[turn, a, 0] == arm[0] and turns[turn, a, 1] == arm[5] and turns[turn, a, 2] == cell):
+        turn = 1 - turn
+        turns[turn, a, 0], turns[turn, a, 1], turns[turn, a, 2] = arm[0], arm[5], cell
+        density.scatter_row(coef, arm[0], arm[5], rows[0, turn, a])
+    which[1, a], which[3, a] = row, turn
+    keys[row, a, 0], keys[row, a, 1] = z[1], z[2]
+    keys[row, a, 2:] = arm
+    summed, scatter, cost, lane = ints[LIKELIHOOD] == EXACT, rows[0, turn, a], rows[1, row, a], rows[2, row, a]
+    fill_row(coef, 0, entries, 1.0, z[1], z[2], arm, summed, scatter, cost, lane)
+    fill_row(coef, entries, halves, -1.0, z[1], z[2], arm, summed, scatter, cost, lane)
+
+
+def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
+    """out = (log prior, log likelihood) of a packed state."""
+    out[0], out[1] = log_prior(z, floats), -math.inf
+    if out[0] == -math.inf:
+        return
+    kind, halves, entries, num = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
+    which, keys, turns, rows, counts, room = memory(cache, halves)
+    if kind == POINT:
+        out[1] = point_score(z, floats, ints, counts)
+        return
+    cell = cell_of(z[1], z[2]) if kind == HALF else 0
+    if kind == HALF:
+        coef = coefficients_at(cell, floats, ints, room)
+    else:
+        coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
+    for a in range(num):
+        update_arm(a, z, coef, float(cell), ints, which, keys, turns, rows)
+    pick, in_lanes, out_lanes = which[1], lanes_of(z, ENTRIES), lanes_of(z, EXITS)
+    if kind == HALF:
+        out[1] = density.closest_arms(rows[1], rows[2], pick, num, 0, entries, in_lanes, counts)
+        out[1] += density.closest_arms(rows[1], rows[2], pick, num, entries, halves, out_lanes, counts)
+        return
+    stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
+    log_clutter, log_kept = floats[LOG_CLUTTER], floats[LOG_KEPT]
+    out[1] = floats[CONSTANT]
+    out[1] += density.sum_arms(rows[1], pick, num, 0, entries, in_lanes, stray, log_clutter, log_kept)
+    out[1] += density.sum_arms(rows[1], pick, num, entries, halves, out_lanes, stray, log_clutter, log_kept)
+
+
+def commit(cache):  # type: ignore[no-untyped-def]
+    """Keep the rows evaluated last."""
+    n = MAX_ARMS
+    for a in range(n):
+        cache[a], cache[2 * n + a] = cache[n + a], cache[3 * n + a]
+
+
+@lru_cache(maxsize=1)
+def compiled() -> tuple[Any, Any, Any]:
+    """(propose, evaluate, commit) with explicit signatures, from the disk cache where possible."""
+    types = kernel_types()
+    build = lambda name, function: nb.njit(types[name], cache=True, error_model="numpy")(function)  # noqa: E731
+    return build("propose", moves.propose), build("evaluate", evaluate), build("commit", commit)
+
+
+def settings(model: Junction) -> Array:
+    """Numbers of the prior and the moves."""
+    low = 0.0 if model.one_way else 1.0
+    spreads = (math.log(model.width), model.width_spread, model.bend_std, model.shift_std)
+    small = float(model.steps == "extended")
+    return np.array([model.centre_std, model.gap_max, *spreads, low, model.max_lanes, small])
+
+
+def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> tuple[Array, NDArray[np.int64]]:
+    """The kernel's floats and ints for observed moments (12, H)."""
+    kind = LIKELIHOODS[model.likelihood]
+    log_share = [math.log(model.clutter) if model.clutter > 0 else -math.inf, math.log1p(-model.clutter)]
+    heading = model.heading_std
+    if kind == EXACT:
+        front, stray = clutter_costs(evidence, model)
+        head = [*settings(model), *log_share, model.position_std, heading, front.sum()]
+        floats = np.concatenate([head, scaled(evidence, observed, model).ravel(), stray])
+        return floats, np.array([kind, evidence.num_halves, evidence.entries, 0, 0], dtype=np.int64)
+    assert evidence.whole is not None
+    points, phi, offsets = evidence.whole.points, evidence.whole.heading, evidence.whole.offsets
+    rows = np.ascontiguousarray(np.vstack([points.T, phi]))
+    num, margin = len(offsets) - 1, int(model.inner_radius)
+    head = [*settings(model), *log_share, model.position_std, heading, 0.0]
+    floats = np.concatenate([head, rows.ravel(), prefix_sums(rows, offsets).ravel()])
+    table = split_table(np.ascontiguousarray(smooth(points, offsets)), offsets)
+    return floats, np.concatenate([[kind, 2 * num, num, num, margin], offsets, table]).astype(np.int64)
+
+
+def junction_kernel(model: Junction, evidence: JunctionEvidence) -> Kernel:
+    """The compiled kernel of a model and its evidence."""
+    assert evidence.moments is not None
+    floats, ints = bound_data(model, evidence, evidence.moments)
+    table = move_table(model)
+    constants = model.constants
+    return Kernel(
+        move_names=tuple(moves.NAMES),
+        probabilities=np.array([table.get(kind, 0.0) for kind in range(len(moves.NAMES))]),
+        num_uniforms=moves.NUM_UNIFORMS,
+        size=SIZE,
+        floats=floats,
+        ints=ints,
+        cache_size=int(memory_size(ints)),
+        propose=compiled()[0],
+        evaluate=compiled()[1],
+        commit=compiled()[2],
+        pack=lambda latents: pack(latents, constants, evidence.origin),
+        unpack=lambda z: unpack(z, constants, evidence.origin),
+    )
+
+
+def move_table(model: Junction) -> dict[int, float]:
+    """{kind: probability} of the model's moves."""
+    return moves.probabilities(model.steps, {name: name not in model.constants for name in ("width", "bend", "shift")})
+
+
+@lru_cache(maxsize=1)
+def _propose_rows() -> Any:
+    """`propose` over rows of states; compiled once."""
+    propose = compiled()[0]
+
+    @nb.njit
+    def rows(kind, z, u, floats, ints, z_new, u_new, log_q, valid):  # type: ignore[no-untyped-def]
+        for b in range(len(z)):
+            valid[b] = propose(kind, z[b], u[b], floats, ints, z_new[b], u_new[b], log_q[b])
+
+    return rows
+
+
+def batched_moves(model: Junction) -> tuple[Move, ...]:
+    """The compiled involutions as moves over batches of latents."""
+    numbers, none = settings(model), np.zeros(1, dtype=np.int64)
+    constants, origin = model.constants, np.zeros(2)
+
+    def involution(kind: int, latents: dict[str, torch.Tensor], u: torch.Tensor) -> Proposal:
+        z = pack(latents, constants, origin)
+        z_new, u_new, log_q = np.empty_like(z), np.empty(u.shape), np.empty((len(z), 3))
+        valid = np.empty(len(z), dtype=np.bool_)
+        _propose_rows()(kind, z, np.ascontiguousarray(u.numpy()), numbers, none, z_new, u_new, log_q, valid)
+        new = {name: torch.from_numpy(np.array(value)) for name, value in unpack(z_new, constants, origin).items()}
+        parts = (torch.from_numpy(np.ascontiguousarray(log_q[:, j])) for j in range(3))
+        return Proposal(new, torch.from_numpy(u_new), *parts, torch.from_numpy(valid))
+
+    return tuple(
+        Move(moves.NAMES[kind], share, moves.NUM_UNIFORMS, partial(involution, kind))
+        for kind, share in move_table(model).items()
+    )

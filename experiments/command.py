@@ -1,0 +1,139 @@
+"""The command line: Hydra composes, signatures check, and every mistake is one sentence.
+
+Hydra itself knows nothing of signatures and prints tracebacks, hence two seams: `SchemaLoader`
+types each composed config before overrides reach it, and `guarded` turns errors into sentences and
+exit codes.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra._internal.hydra
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from experiments.schema import check_values, expand, suggest
+from experiments.signatures import ConfigError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class SchemaLoader(ConfigLoaderImpl):
+    """Hydra's loader, with every `_target_` node typed by its target's signature.
+
+    Command-line overrides meet the typed nodes, so that a misspelt key or a wrong type fails there,
+    and `--cfg job` shows every default."""
+
+    def _compose_config_from_defaults_list(self, *args: Any, **kwargs: Any) -> DictConfig:
+        config = super()._compose_config_from_defaults_list(*args, **kwargs)
+        expand(config)
+        return config
+
+    def load_configuration(self, *args: Any, **kwargs: Any) -> DictConfig:
+        config = super().load_configuration(*args, **kwargs)
+        check_values(config)
+        return config
+
+
+hydra._internal.hydra.ConfigLoaderImpl = SchemaLoader  # type: ignore[misc]  # Hydra 1.3 has no seam here
+
+
+class JobFailed(Exception):
+    """A run failed and has said why; the argument is the exit code."""
+
+
+def in_words(error: BaseException) -> str | None:
+    """One sentence for a mistake of the person who launched the run; None for any other error."""
+    if isinstance(error, MissingConfigException):
+        return _missing(error)
+    if isinstance(error, OverrideParseException):
+        return f"cannot read the setting '{error.override}'; write key=value, and quote what the shell would split"
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        causes: list[BaseException] = [error]
+        while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
+            causes.append(cause)
+        unknown = next((c for c in causes if isinstance(c, ConfigAttributeError | ConfigKeyError)), None)
+        if unknown is not None and isinstance(unknown.parent_node, DictConfig):
+            return _unknown_key(unknown)
+        typed = next((c for c in causes if isinstance(c, OmegaConfBaseException) and c.full_key), None)
+        if typed is not None:
+            return f"{typed.full_key}: {_first_line(typed)}"
+        return " ".join(str(causes[0]).split()) or " ".join(str(causes[-1]).split())
+    program = sys.modules.get("models.program")  # where it was never imported, nobody raised its InputError
+    kinds = (ConfigError, program.InputError) if program else (ConfigError,)
+    return str(error) if isinstance(error, kinds) else None
+
+
+def _first_line(error: Any) -> str:
+    text = str(error).partition("\n")[0]
+    return text.replace("$VALUE_TYPE", type(error.value).__name__).replace("$VALUE", str(error.value))
+
+
+def _missing(error: MissingConfigException) -> str:
+    group, _, name = str(error.missing_cfg_file or "").rpartition("/")
+    if group and error.options:
+        return f"there is no {group} called '{name}'{suggest(name, error.options)}"
+    return " ".join(str(error).splitlines()[0].split())
+
+
+def _unknown_key(error: Any) -> str:
+    node = error.parent_node
+    path = node._get_full_key(None)
+    known = [key for key in node if key != "hydra" and not str(key).startswith("_")]
+    owner = f"{path} has no knob" if path else "a run has no key"
+    return f"{owner} '{error.key}'{suggest(str(error.key), known)}"
+
+
+def complain(error: BaseException, where: str = "waybayes") -> int:
+    """Print what went wrong to stderr and return the exit code: 2 for a mistake of use, 1 otherwise."""
+    sentence = in_words(error)
+    if sentence is None:
+        print(f"{where} failed:", file=sys.stderr)
+        traceback.print_exception(error)
+        return 1
+    print(f"{where}: {sentence}", file=sys.stderr, flush=True)
+    return 2
+
+
+def guarded(work: Callable[[], object]) -> int:
+    """Run a command; its exit code."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then hands errors through
+    sys.path.append(os.getcwd())  # last, so that a model beside the user is found and hides nothing
+    try:
+        check_names()
+        work()
+    except JobFailed as failed:
+        return int(failed.args[0])
+    except (KeyboardInterrupt, BrokenPipeError):
+        return 130
+    except Exception as error:
+        return complain(error)
+    return 0
+
+
+def check_names() -> None:
+    """Raise ConfigError where a folder of the user's hides one of our packages."""
+    for name in ("models", "inference", "experiments", "configs"):
+        spec = importlib.util.find_spec(name)
+        places = list(spec.submodule_search_locations or []) if spec else []
+        if Path(places[0] if places else ".").resolve() != ROOT / name:
+            raise ConfigError(
+                f"the package '{name}' that Python finds ({places[0] if places else 'none'}) is not waybayes' own; "
+                "a folder of that name hides it: call `waybayes` from elsewhere or rename the folder"
+            )
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """The resolved config as plain dictionaries."""
+    container = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}

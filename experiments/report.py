@@ -1,0 +1,140 @@
+"""A run as one self-contained page: scores, how the engine fared, figures, settings, provenance."""
+
+from __future__ import annotations
+
+import base64
+import math
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+if TYPE_CHECKING:
+    from experiments.run import Result
+
+UNITS = {
+    "m": "m", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
+    "sd": "sd", "nats": "nats", "pct": "%", "hz": "Hz",
+}  # fmt: skip
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; max-width: 62rem; margin: 2.5rem auto; padding: 0 1.5rem }
+h1 { font-size: 1.5rem; margin-bottom: .2rem } h2 { font-size: 1.05rem; margin: 2.2rem 0 .6rem; color: #2f6f9f }
+p.sub { color: #667085; margin-top: 0 } img { max-width: 100%; margin: .5rem 0 1rem }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums } .wide { overflow-x: auto }
+th, td { text-align: left; padding: .28rem 1.2rem .28rem 0; border-bottom: 1px solid #e4e7ec; vertical-align: top }
+th { color: #667085; font-weight: 600 } td.n { text-align: right }
+.flag { background: #fdf0e7; border-left: 4px solid #d1702c; padding: .5rem .9rem; margin: .4rem 0 }
+.good { background: #ecf5ef; border-left: 4px solid #3b8a5a; padding: .5rem .9rem; margin: .4rem 0 }
+pre { background: #f6f7f9; padding: .9rem; overflow-x: auto; font-size: 13px }
+summary { cursor: pointer; color: #2f6f9f }
+"""
+
+
+def write_report(folder: Path, title: str, result: Result, manifest: dict[str, Any]) -> None:
+    """Write figures/*.png and report.html, which embeds them and needs nothing else."""
+    images = save_figures(folder, result.figures)
+    info = result.posterior.info
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="sub">scene {escape(result.scene.name)} &middot; {escape(manifest["date"])}</p>',
+        _flags(info.get("flags")),
+        "<h2>Scores</h2>",
+        table(("metric", "value", "unit"), [(label, v, unit) for (label, unit), v in _labelled(result.scores)]),
+        "".join(f"<h2>{escape(name)}</h2>{image}" for name, image in images.items()),
+        "<h2>Engine</h2>",
+        engine_tables(info, result.posterior.log_evidence),
+        "<h2>Time</h2>",
+        table(("stage", "seconds"), list(result.seconds.items())),
+        "<h2>Settings and provenance</h2>",
+        details("config", manifest["config"]),
+        details("manifest", {k: v for k, v in manifest.items() if k != "config"}),
+    ]
+    (folder / "report.html").write_text(page(title, "".join(body)))
+
+
+def save_figures(folder: Path, figures: dict[str, Any]) -> dict[str, str]:
+    """Write figures/*.png; {name: <img> with the picture inside}."""
+    images = {}
+    for name, figure in figures.items():
+        file = folder / "figures" / f"{name}.png"
+        file.parent.mkdir(exist_ok=True)
+        figure.savefig(file, dpi=130)
+        data = base64.b64encode(file.read_bytes()).decode()
+        images[name] = f'<img alt="{escape(name)}" src="data:image/png;base64,{data}">'
+    return images
+
+
+def _labelled(scores: dict[str, float]) -> list[tuple[tuple[str, str], float]]:
+    return [(split_unit(name), value) for name, value in scores.items()]
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A readable label and the unit that stands at the end of a metric's name."""
+    head, _, tail = name.rpartition("_")
+    return (head.replace("_", " "), UNITS[tail]) if head and tail in UNITS else (name.replace("_", " "), "")
+
+
+def number(value: Any) -> str:
+    """Four digits, without noise."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if isinstance(value, int) or (math.isfinite(value) and value == int(value) and abs(value) < 1e9):
+        return f"{int(value)}"
+    return f"{value:.4g}"
+
+
+def table(head: tuple[str, ...], rows: list[Any]) -> str:
+    """An HTML table; numbers are aligned to the right."""
+    if not rows:
+        return "<p>none</p>"
+    cell = lambda v: f'<td class="n">{number(v)}</td>' if isinstance(v, int | float) else f"<td>{escape(str(v))}</td>"  # noqa: E731
+    lines = ["<tr>" + "".join(cell(value) for value in row) + "</tr>" for row in rows]
+    top = "".join(f"<th>{escape(name)}</th>" for name in head)
+    return f'<div class="wide"><table><tr>{top}</tr>{"".join(lines)}</table></div>'
+
+
+def _flags(flags: Any) -> str:
+    """What the engine itself says about its convergence."""
+    if flags is None:
+        return ""
+    items = [f"{k}: {v}" for k, v in flags.items()] if isinstance(flags, dict) else list(flags)
+    if not items:
+        return '<p class="good">The engine raised no flag.</p>'
+    return "".join(f'<p class="flag">{escape(str(item))}</p>' for item in items)
+
+
+def engine_tables(info: dict[str, Any], log_evidence: float | None) -> str:
+    """Plain values in one table, and one table for each value by name (acceptance by move, ESS by site)."""
+    plain = [(k, v) for k, v in info.items() if not isinstance(v, dict | list | tuple) and k != "flags"]
+    plain += [("log evidence [nats]", log_evidence)] if log_evidence is not None else []
+    parts = [table(("", "value"), plain)]
+    for name, values in info.items():
+        if isinstance(values, dict) and values and name != "flags":
+            parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2>{_by_name(values)}")
+        elif isinstance(values, list | tuple) and values and name != "flags":
+            parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2><p>{escape(', '.join(map(number, values)))}</p>")
+    return "".join(parts)
+
+
+def _by_name(values: dict[str, Any]) -> str:
+    """A table of a dictionary; where its values are dictionaries, one column for each of their keys."""
+    if all(isinstance(v, dict) for v in values.values()):
+        columns = list(dict.fromkeys(key for v in values.values() for key in v))
+        return table(("", *columns), [(name, *(v.get(c, "") for c in columns)) for name, v in values.items()])
+    return table(("", "value"), list(values.items()))
+
+
+def details(title: str, content: Any) -> str:
+    """A folded block of YAML."""
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
+
+
+def page(title: str, body: str) -> str:
+    """A whole HTML page, without outside resources."""
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style></head><body>{body}</body></html>"
+    )

@@ -1,0 +1,112 @@
+"""Config schemas generated from signatures.
+
+A config node with a `_target_` may hold what the target's signature names, and nothing else:
+
+    engine:                                   inference.rjmcmc.run(model, evidence, *, seed,
+      _target_: inference.rjmcmc.run    ->                         num_steps: int = 5000, ...)
+      _partial_: true                         becomes a typed node {num_steps: 5000, ...}
+
+A node with `_partial_: true` becomes a function that still awaits what run() supplies.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+from collections.abc import Iterable, Iterator
+from dataclasses import field, make_dataclass
+from typing import Any
+
+from omegaconf import MISSING, BooleanNode, Container, DictConfig, IntegerNode, ListConfig, OmegaConf
+
+from experiments.signatures import ConfigError, Knob, knobs, locate
+
+SUPPLIED = frozenset({"model", "evidence", "scene", "posterior", "seed"})  # by run(), to partial targets
+
+
+def suggest(name: str, known: Iterable[Any]) -> str:
+    """'; did you mean ...?', or the list of what there is."""
+    names = sorted(map(str, known))
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    return f"; did you mean '{close[0]}'?" if close else f"; there is {', '.join(names) or 'none'}"
+
+
+def _targets(config: Container, path: str = "") -> Iterator[tuple[Any, Any, str, DictConfig]]:
+    """(parent, key, path, node) of every node with a `_target_`, innermost first."""
+    keys = range(len(config)) if isinstance(config, ListConfig) else [k for k in config if k != "hydra"]
+    for key in keys:
+        node = config._get_node(key)
+        if isinstance(node, Container) and not node._is_none() and not node._is_missing():
+            here = f"{path}.{key}" if path else str(key)
+            yield from _targets(node, here)
+            if isinstance(node, DictConfig) and "_target_" in node:
+                yield config, key, here, node
+
+
+def _settable(node: Any) -> dict[str, Knob]:
+    supplied = SUPPLIED if node.get("_partial_", False) else frozenset()
+    return {name: knob for name, knob in knobs(node["_target_"]).items() if name not in supplied}
+
+
+def expand(config: DictConfig) -> None:
+    """Give every node with a `_target_` the typed schema of its signature, in place.
+
+    Plain numbers and switches beside them keep the type they have. Raises ConfigError for a key
+    that a target does not take; OmegaConf raises for a value of the wrong type."""
+    for parent, key, path, node in list(_targets(config)):
+        allowed = _allowed(path, node)
+        entries: list[Any] = [("_target_", str, node["_target_"])]
+        entries += [("_partial_", bool, field(default=True))] if node.get("_partial_", False) else []
+        entries += [(k.name, k.kind, _default(k.default)) for k in allowed.values()]
+        schema = OmegaConf.structured(make_dataclass("Schema", entries, kw_only=True))
+        parent[key] = OmegaConf.merge(schema, node)
+    for key, value in config.items():
+        if isinstance(value, bool | int):
+            config[key] = (BooleanNode if isinstance(value, bool) else IntegerNode)(value, is_optional=False)
+
+
+def _allowed(path: str, node: DictConfig) -> dict[str, Knob]:
+    """The knobs of a node. Raises ConfigError for a key that is none."""
+    allowed = _settable(node)
+    for name in map(str, node):
+        if name not in allowed and name not in ("_target_", "_partial_"):
+            raise ConfigError(f"{path} has no knob '{name}'{suggest(name, allowed)}")
+    return allowed
+
+
+def _default(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        return field(default_factory=lambda: list(value))
+    if isinstance(value, dict):
+        return field(default_factory=lambda: dict(value))
+    return field(default=value)
+
+
+def check_values(config: DictConfig) -> None:
+    """Raise ConfigError for what no type catches: an added key, a value its Literal does not list."""
+    for _, _, path, node in _targets(config):
+        for name, knob in _allowed(path, node).items():
+            if knob.choices and not OmegaConf.is_missing(node, name) and node[name] not in knob.choices:
+                raise ConfigError(f"{path}.{name} is '{node[name]}'{suggest(str(node[name]), knob.choices)}")
+
+
+def build(node: Any, path: str) -> Any:
+    """Call what a resolved config node names; a partial node becomes a function awaiting the rest.
+
+    Raises ConfigError for an argument without a value."""
+    if isinstance(node, list):
+        return [build(item, f"{path}[{i}]") for i, item in enumerate(node)]
+    if not isinstance(node, dict):
+        return node
+    if "_target_" not in node:
+        return {key: build(value, f"{path}.{key}") for key, value in node.items()}
+    arguments = {}
+    for name, knob in _settable(node).items():
+        value = node.get(name, MISSING)
+        if value == MISSING and knob.required:
+            raise ConfigError(f"{path}.{name} has no value; give one with {path}.{name}=...")
+        if value != MISSING:
+            value = build(value, f"{path}.{name}")
+            arguments[name] = tuple(value) if knob.is_tuple and isinstance(value, list) else value
+    function = locate(node["_target_"])
+    return functools.partial(function, **arguments) if node.get("_partial_", False) else function(**arguments)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from experiments.scenarios.scene import Floats, Ints, JunctionTruth, join_tracks
 from models.intersection.tracks import Tracks
 
-RANGE = 50.0  # of the sensor [m]
+RANGE = 60.0  # of the sensor [m]
 OBSTACLES = 3  # standing vehicles
 OBSTACLE_RADIUS = 2.0  # a van, from any side [m]
 BRIDGED = 5  # points that a tracker coasts over, for the edge of a shadow is crossed to and fro in noise
@@ -21,7 +21,7 @@ SHORTEST = 10  # points of a piece that still counts as a track
 def occlude(data: Tracks, track_lane: Ints, truth: JunctionTruth, rng: np.random.Generator) -> tuple[Tracks, Ints]:
     """Keep what an ego vehicle sees that waits on an entry of a random arm, 5 m before the interior.
 
-    It sees 50 m far. Three vans stand 8 to 25 m away within 60 degrees of the centre's direction and
+    It sees 60 m far. Three vans stand 8 to 25 m away within 60 degrees of the centre's direction and
     hide what lies behind them. A track that disappears for more than 5 points and comes back becomes
     two; pieces seen in fewer than 10 points are lost. Whole lanes may stay unseen: the truth still
     holds them."""

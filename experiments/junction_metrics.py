@@ -1,0 +1,87 @@
+"""Is the estimated junction the true one: arms, lanes, and how sure the posterior is.
+
+"Structure right" is ours: every arm found within 10 degrees, no further arm, and the number of
+entries and exits right on each; [M20] section V leaves the structure unevaluated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from experiments.scenarios.paths import wrap
+from experiments.scenarios.scene import JunctionTruth, Scene
+from inference.posterior import Posterior
+
+Estimate = Mapping[str, NDArray[Any]]  # one state: num_arms (), centre (2,), fields of S arm slots (S,)
+
+TOLERANCE_DEG = 10.0  # between the directions of an estimated arm and its true one
+
+
+def structure(estimate: Estimate, truth: JunctionTruth, tolerance_deg: float = TOLERANCE_DEG) -> dict[str, float]:
+    """Compare one state with the truth.
+
+    arms_right       1 where as many arms as true, each within the tolerance of its own true arm
+    structure_right  1 where moreover the entries and exits of every arm are right
+    lanes_right      share of the 2K lane counts that are right; those of a missed arm are wrong
+    angle_error_deg  mean over matched arms, nan where there is none
+    centre_error_m   distance of the centres
+    gap_error_m      mean over matched arms with a known gap, nan where there is none
+    """
+    slots, arms, difference = match(estimate, truth, tolerance_deg)
+    entries = np.asarray(estimate["entries"])[slots] == truth.entries[arms]
+    exits = np.asarray(estimate["exits"])[slots] == truth.exits[arms]
+    arms_right = len(arms) == len(truth.angle) == int(estimate["num_arms"])
+    gaps = np.abs(np.asarray(estimate["gap"])[slots] - truth.gap[arms])
+    return {
+        "arms_right": float(arms_right),
+        "structure_right": float(arms_right and entries.all() and exits.all()),
+        "lanes_right": float(entries.sum() + exits.sum()) / (2 * len(truth.angle)),
+        "angle_error_deg": _mean(np.degrees(difference)),
+        "centre_error_m": float(np.linalg.norm(np.asarray(estimate["centre"]) - truth.centre)),
+        "gap_error_m": _mean(gaps[np.isfinite(gaps)]),
+    }
+
+
+def match(
+    estimate: Estimate, truth: JunctionTruth, tolerance_deg: float = TOLERANCE_DEG
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Pair estimated with true arms one to one: as many pairs within the tolerance as possible, of these
+    the closest. Returns slots (M,), true arms (M,) and angles between them (M,) [rad]."""
+    active = np.asarray(estimate["angle"])[: int(estimate["num_arms"])]
+    difference = np.abs(wrap(active[:, None] - truth.angle))  # (arms estimated, K)
+    near = difference <= np.radians(tolerance_deg)
+    slots, arms = linear_sum_assignment(np.where(near, difference, 100.0))
+    matched = near[slots, arms]
+    slots, arms = slots[matched], arms[matched]
+    return slots, arms, difference[slots, arms]
+
+
+def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
+    """Scores of the estimate as in `structure`, and of the draws:
+
+    arm_count_probability    posterior probability of the true number of arms
+    lane_counts_probability  that of the true structure, arms and lane counts
+
+    Nothing where the truth is unknown."""
+    truth = scene.truth
+    if truth is None:
+        return {}
+    weights = posterior.weights.reshape(-1)
+    draws = {site: values.reshape((-1, *values.shape[2:])) for site, values in posterior.draws.items()}
+    right_count = draws["num_arms"] == len(truth.angle)
+    right_lanes = 0.0
+    for i in np.flatnonzero(right_count):
+        right_lanes += weights[i] * structure({s: v[i] for s, v in draws.items()}, truth)["structure_right"]
+    return structure(posterior.estimate, truth) | {
+        "arm_count_probability": float(weights[right_count].sum()),
+        "lane_counts_probability": float(right_lanes),
+    }
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return float(values.mean()) if len(values) else float("nan")

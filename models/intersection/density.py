@@ -119,10 +119,8 @@ def sum_arms(rows, pick, num_arms, first, last, num_lanes, clutter, log_clutter,
     num_lanes    lanes of this side on all arms
     clutter      (H,) -log p_0 minus the Gaussian normaliser of the half
     log_clutter  log of the share of clutter, log_kept of the rest"""
-    if last == first:
-        return 0.0
-    if num_lanes < 0.5:
-        return -math.inf
+    if num_lanes < 0.5:  # nowhere to be: every half is stray
+        return -clutter[first:last].sum()
     label = log_kept - math.log(num_lanes)
     total = 0.0
     for h in range(first, last):

@@ -334,6 +334,7 @@ BAD_TABLES = {
     "nan": (HEADER + "a,0,0,0\na,0.1,1,nan\n", r"row 3, vehicle a: y is 'nan'"),
     "infinite": (HEADER + "a,0,0,0\na,inf,1,0\n", r"row 3, vehicle a: t is 'inf'"),
     "short row": (HEADER + "a,0,0,0\na,0.1,1\n", r"row 3, vehicle a: y is ''"),
+    "no vehicle": (HEADER + "a,0,0,0\n,0.1,1,0\n", r"row 3: vehicle is empty"),
     "unsorted times": (HEADER + "a,0,0,0\nb,0,0,0\na,2,1,0\na,1,2,0\n", r"row 5, vehicle a: t = 1 comes after t = 2"),
     "duplicate times": (HEADER + "a,0,0,0\na,1,1,0\na,1,2,0\n", r"row 4, vehicle a: t = 1 comes twice"),
     "one point per vehicle": (HEADER + "a,0,0,0\nb,0,5,0\n", r"each of the 2 vehicles has a single point"),

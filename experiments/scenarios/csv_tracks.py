@@ -125,6 +125,8 @@ def read(path: str | Path, types: tuple[str, ...] | None = None) -> list[Recorde
         has_heading = "heading" in row
         if types is not None and row["type"] not in types:
             continue
+        if not row["vehicle"]:
+            raise InputError(f"{path}, row {number}: vehicle is empty; give every row the number of its vehicle")
         key = (row.get("recording", ""), row["vehicle"])
         where = f"{path}, row {number}, vehicle {row['vehicle']}"
         columns = ("t", "x", "y", "heading") if has_heading else ("t", "x", "y")

@@ -77,8 +77,10 @@ def flags(posterior: Posterior, *, max_r_hat: float = 1.01, min_ess: float = 400
 
 
 def r_hat(draws: Array) -> float:
-    """Rank-normalised split R-hat of draws (chain, draw); NaN for a single chain."""
-    return float(_arviz().rhat(draws)) if draws.shape[0] > 1 else float("nan")
+    """Rank-normalised split R-hat of draws (chain, draw); NaN for a single chain and for constants."""
+    if draws.shape[0] == 1 or np.ptp(draws) == 0:
+        return float("nan")
+    return float(_arviz().rhat(draws))
 
 
 def standard_error(draws: Array) -> float:

@@ -1,0 +1,87 @@
+"""Diagnostics against chains whose autocorrelation is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from inference import diagnostics
+from inference.posterior import Posterior
+
+
+def chains(rho: float, num_draws: int, *, seed: int = 0, num_chains: int = 4) -> np.ndarray:
+    """Stationary first-order autoregression with standard normal marginals, (chain, draw)."""
+    noise = np.random.default_rng(seed).normal(size=(num_chains, num_draws))
+    values = noise.copy()
+    for t in range(1, num_draws):
+        values[:, t] = rho * values[:, t - 1] + math.sqrt(1 - rho**2) * noise[:, t]
+    return values
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_standard_error_accounts_for_autocorrelation(rho: float) -> None:
+    """sd sqrt((1 + rho) / (1 - rho) / n); ESS itself is estimated to some 10 % at this length."""
+    exact = math.sqrt((1 + rho) / (1 - rho) / (4 * 5000))
+    assert diagnostics.standard_error(chains(rho, 5000)) == pytest.approx(exact, rel=0.2)
+
+
+def test_summary_holds_mean_sd_and_effective_draws_of_every_element() -> None:
+    values = np.stack([chains(0.0, 1000), 3.0 + 2.0 * chains(0.8, 1000, seed=1)], -1)
+    table = diagnostics.summary(Posterior({"z": values}))
+    assert set(table) == {"z[0]", "z[1]"}
+    row = table["z[1]"]
+    assert row["mean"] == pytest.approx(values[..., 1].mean())
+    assert row["sd"] == pytest.approx(values[..., 1].std())
+    assert row["r_hat"] < 1.05
+    assert row["ess_bulk"] == pytest.approx(4000 / 9, rel=0.3)
+    assert abs(row["mean"] - 3.0) < 4 * row["mcse"]
+
+
+def test_chains_apart_are_flagged_in_words() -> None:
+    apart = chains(0.0, 500) + np.array([[0.0], [0.0], [0.0], [3.0]])
+    found = diagnostics.flags(Posterior({"d0": apart}))
+    assert any(flag.startswith("r_hat of 'd0' is 1.") and "over 4 chains" in flag for flag in found)
+
+
+def test_few_effective_draws_are_told() -> None:
+    found = diagnostics.flags(Posterior({"d0": chains(0.9, 600)}), max_r_hat=2.0)
+    assert len(found) == 1
+    assert "effective draws (below 400)" in found[0]
+
+
+def test_good_chains_and_constants_raise_no_flag() -> None:
+    good = Posterior({"d0": chains(0.0, 1000), "fixed": np.ones((4, 1000))})
+    assert diagnostics.flags(good) == []
+
+
+def test_flags_of_the_engine_come_first() -> None:
+    posterior = Posterior({"d0": chains(0.9, 600)}, info={"flags": ["not converged: why"]})
+    assert diagnostics.flags(posterior)[0] == "not converged: why"
+
+
+def test_a_single_chain_has_no_r_hat() -> None:
+    row = diagnostics.summary(Posterior({"d0": chains(0.0, 1000, num_chains=1)}))["d0"]
+    assert math.isnan(row["r_hat"])
+    assert row["ess_bulk"] > 500
+
+
+def test_weighted_draws_count_by_their_weights() -> None:
+    log_weights = np.where(np.arange(1000) < 100, 0.0, -np.inf)[None]
+    row = diagnostics.summary(Posterior({"d0": chains(0.0, 1000, num_chains=1)}, log_weights=log_weights))["d0"]
+    assert row["ess_bulk"] == pytest.approx(100.0)
+    assert row["mcse"] == pytest.approx(row["sd"] / 10)
+
+
+def test_slots_are_not_averaged_where_the_dimension_is_unknown() -> None:
+    index = np.random.default_rng(0).integers(0, 3, (4, 500))
+    posterior = Posterior({"d0": chains(0.0, 500), "knot": np.zeros((4, 500, 2))}, model_index=index)
+    assert set(diagnostics.summary(posterior)) == {"model_index", "d0"}
+
+
+def test_model_probabilities_come_with_their_binomial_error() -> None:
+    index = np.random.default_rng(0).integers(0, 4, (4, 2000))
+    for share, error in diagnostics.model_probabilities(Posterior({"z": index * 1.0}, model_index=index)).values():
+        assert error == pytest.approx(math.sqrt(0.25 * 0.75 / 8000), rel=0.2)
+        assert abs(share - 0.25) < 4 * error

@@ -39,10 +39,12 @@ def write_report(folder: Path, title: str, result: Result, manifest: dict[str, A
     body = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="sub">scene {escape(result.scene.name)} &middot; {escape(manifest["date"])}</p>',
-        _flags(info.get("flags")),
+        _flags(result.flags),
         "<h2>Scores</h2>",
         table(("metric", "value", "unit"), [(label, v, unit) for (label, unit), v in _labelled(result.scores)]),
         "".join(f"<h2>{escape(name)}</h2>{image}" for name, image in images.items()),
+        "<h2>Convergence</h2>",
+        _by_name(result.diagnostics),
         "<h2>Engine</h2>",
         engine_tables(info, result.posterior.log_evidence),
         "<h2>Time</h2>",
@@ -95,14 +97,11 @@ def table(head: tuple[str, ...], rows: list[Any]) -> str:
     return f'<div class="wide"><table><tr>{top}</tr>{"".join(lines)}</table></div>'
 
 
-def _flags(flags: Any) -> str:
-    """What the engine itself says about its convergence."""
-    if flags is None:
-        return ""
-    items = [f"{k}: {v}" for k, v in flags.items()] if isinstance(flags, dict) else list(flags)
-    if not items:
-        return '<p class="good">The engine raised no flag.</p>'
-    return "".join(f'<p class="flag">{escape(str(item))}</p>' for item in items)
+def _flags(flags: list[str]) -> str:
+    """What speaks against the draws."""
+    if not flags:
+        return '<p class="good">No convergence flag was raised.</p>'
+    return "".join(f'<p class="flag">{escape(flag)}</p>' for flag in flags)
 
 
 def engine_tables(info: dict[str, Any], log_evidence: float | None) -> str:

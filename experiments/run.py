@@ -39,14 +39,18 @@ Draw = Callable[["Posterior", "Scene"], dict[str, "Figure"]]
 class Result(NamedTuple):
     """What a run found out.
 
-    scores   {metric: value}, units at the end of the names
-    figures  {name: figure}
-    seconds  {stage: seconds}
+    scores       {metric: value}, units at the end of the names
+    diagnostics  {scalar: mean, sd, r_hat, ess_bulk, mcse} (inference.diagnostics.summary)
+    flags        what speaks against the draws, in words
+    figures      {name: figure}
+    seconds      {stage: seconds}
     """
 
     scene: Scene
     posterior: Posterior
     scores: dict[str, float]
+    diagnostics: dict[str, dict[str, float]]
+    flags: list[str]
     figures: dict[str, Figure]
     seconds: dict[str, float]
 
@@ -62,6 +66,7 @@ def run(
     say: Callable[[str], None] = lambda line: None,
 ) -> Result:
     """Run one experiment. Raises InputError where scenario, model and engine do not fit."""
+    from inference import diagnostics
     from models.program import check
 
     seconds: dict[str, float] = {}
@@ -85,9 +90,11 @@ def run(
     say(f"posterior  {' x '.join(map(str, posterior.shape))} draws in {seconds['engine']:.2f} s")
     with stage("metrics"):
         scores = {name: float(value) for metric in metrics for name, value in metric(posterior, scene).items()}
+    with stage("diagnostics"):
+        summary, flags = diagnostics.summary(posterior), diagnostics.flags(posterior)
     with stage("figures"):
         drawn = {name: figure for draw in figures for name, figure in draw(posterior, scene).items()}
-    return Result(scene, posterior, scores, drawn, seconds)
+    return Result(scene, posterior, scores, summary, flags, drawn, seconds)
 
 
 def engine_seed(seed: int) -> int:
@@ -144,6 +151,7 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
     seeds = {"run": job.config["seed"], "engine": engine_seed(job.config["seed"])}
     with store.writing(job.folder) as folder:
         store.write_json(folder / "scores.json", result.scores)
+        store.write_json(folder / "diagnostics.json", {"summary": result.diagnostics, "flags": result.flags})
         result.posterior.save(folder)
         manifest = store.manifest(job.config, seeds, result.seconds, result.scene.info)
         write_report(folder, job.name, result, manifest)

@@ -90,7 +90,7 @@ def check_values(config: DictConfig) -> None:
                 raise ConfigError(f"{path}.{name} is '{node[name]}'{suggest(str(node[name]), knob.choices)}")
 
 
-def build(node: Any, path: str) -> Any:
+def build(node: Any, path: str = "") -> Any:
     """Call what a resolved config node names; a partial node becomes a function awaiting the rest.
 
     Raises ConfigError for an argument without a value."""
@@ -99,7 +99,7 @@ def build(node: Any, path: str) -> Any:
     if not isinstance(node, dict):
         return node
     if "_target_" not in node:
-        return {key: build(value, f"{path}.{key}") for key, value in node.items()}
+        return {key: build(value, f"{path}.{key}" if path else str(key)) for key, value in node.items()}
     arguments = {}
     for name, knob in _settable(node).items():
         value = node.get(name, MISSING)

@@ -1,7 +1,8 @@
 """Each run in its own folder, written whole or not at all.
 
     runs/<scenario>-<model>-<engine>-<identity>/
-        manifest.json  scores.json  posterior.npz  posterior.json  figures/*.png  report.html
+        manifest.json  scores.json  diagnostics.json  posterior.npz  posterior.json
+        figures/*.png  report.html
 
 The identity is a hash of the resolved config, of the source code and of the input files: a run that
 is done under the same identity need not run again.

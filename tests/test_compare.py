@@ -1,0 +1,49 @@
+"""The comparison: one row for each engine, failures included, against the exact posterior."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments.compare import against, plan
+from experiments.signatures import ConfigError
+from tests.conftest import Command
+
+
+def test_a_biased_engine_stands_out_and_a_broken_one_is_a_row(launch: Command) -> None:
+    for name, knob in (("biased", "shift: 0.5"), ("broken", "fail_at: 200")):
+        Path(f"conf/engine/{name}.yaml").write_text(f"_target_: fake_engine.run\n_partial_: true\n{knob}\n")
+    path = f"hydra.searchpath=[file://{Path.cwd()}/conf]"
+    words = ["engines=[fake,biased,broken]", "seeds=2", "fake.num_draws=300", path]
+    done = launch(*words, module="experiments.compare")
+    assert done.returncode == 1
+    assert done.stderr == "broken: num_draws is 200; choose another\n"
+    (folder,) = Path("runs").glob("compare-line-gaussian-*")
+    with (folder / "compare.csv").open() as file:
+        rows = {row["engine"]: row for row in csv.DictReader(file)}
+    assert float(rows["fake"]["z_max"]) < 4.0  # the larger of two standard normal numbers
+    assert float(rows["biased"]["z_max"]) > 20.0  # 0.5 away, where 400 draws know the mean to less than 0.01
+    assert float(rows["fake"]["evaluations"]) == 300 and float(rows["biased"]["evaluations"]) == 200
+    assert rows["broken"]["seeds"] == "0" and "choose another" in rows["broken"]["error"]
+    assert len(json.loads((folder / "compare.json").read_text())["runs"]["fake"]) == 2
+    assert "choose another" in (folder / "report.html").read_text()
+
+    calls = Path("calls.txt").read_text()
+    launch(*words, module="experiments.compare")
+    assert len(Path("calls.txt").read_text().split()) == len(calls.split()) + 1  # the broken one alone
+
+
+@pytest.mark.parametrize("word", ["seeds=0", "seeds=two", "engine=rjmcmc", "seed=3"])
+def test_words_that_a_comparison_does_not_take_are_refused(word: str) -> None:
+    with pytest.raises(ConfigError, match=r"seeds|engines=\[...\]"):
+        plan([word])
+
+
+def test_the_distance_to_the_reference_follows_its_definition() -> None:
+    own = {"a": {"mean": 1.0, "sd": 2.0, "mcse": 0.3}, "b": {"mean": 0.0, "sd": 1.0, "mcse": 0.1}}
+    reference = {"a": {"mean": 0.0, "sd": 1.0, "mcse": 0.4}, "b": {"mean": 0.0, "sd": 0.5, "mcse": 0.0}}
+    distance = against(own, reference, by_position=False)
+    assert distance == pytest.approx({"mean_error_sd": 0.5**0.5, "sd_ratio": 2.0, "z_max": 2.0})

@@ -1,0 +1,150 @@
+"""Every config composes, its targets exist, and a signature is its schema."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_module
+from hydra.errors import ConfigCompositionException
+from omegaconf import MISSING, OmegaConf
+
+import experiments.command  # noqa: F401  (installs the schemas)
+from experiments.command import in_words, plain
+from experiments.schema import build, check_values, expand
+from experiments.signatures import ConfigError, knobs, locate
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+OPTIONS = [
+    (group.name, file.stem)
+    for group in sorted(CONFIGS.iterdir())
+    if group.is_dir() and not group.name.startswith("_")
+    for file in sorted(group.glob("*.yaml"))
+]
+
+
+@pytest.fixture(autouse=True)
+def hydra_context() -> Iterator[None]:
+    with initialize_config_module("configs", version_base="1.3"):
+        yield
+
+
+@pytest.mark.parametrize(("group", "name"), OPTIONS)
+def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: str) -> None:
+    config = plain(compose("run", [f"{group}={name}"]))
+    for target in targets_of(config):
+        function = locate(target["_target_"])
+        keys = {key: 0 for key in target if not key.startswith("_")}
+        inspect.signature(function).bind_partial(**keys)  # raises TypeError for a key it does not take
+    build(config["model"], "model")
+    build({key: config[key] for key in ("engine", "metrics", "figures")})
+
+
+def targets_of(node: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(node, dict) and "_target_" in node:
+        yield node
+    for child in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        yield from targets_of(child)
+
+
+def test_a_config_shows_the_defaults_of_the_signature() -> None:
+    config = compose("run", ["model=gaussian"])
+    function = locate(config.engine._target_)
+    parameter = inspect.signature(function).parameters["num_steps"]
+    assert config.engine.num_steps == parameter.default
+    assert list(config.model.prior_std) == list(locate(config.model._target_)().prior_std)
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [
+        ("engine.num_step=5", "engine has no knob 'num_step'; did you mean 'num_steps'?"),
+        ("+engine.num_step=5", "engine has no knob 'num_step'; did you mean 'num_steps'?"),
+        ("engine.num_steps=many", "engine.num_steps: Value 'many' of type 'str' could not be converted to Integer"),
+        ("scenario.num=2.5", "scenario.num: Value '2.5' of type 'float' could not be converted to Integer"),
+        ("sed=1", "a run has no key 'sed'; did you mean 'seed'?"),
+        ("seed=one", "seed: Value 'one' of type 'str' could not be converted to Integer"),
+        ("engine=rjmcm", "there is no engine called 'rjmcm'; did you mean 'rjmcmc'?"),
+        ("models=gaussian", "a run has no key 'models'; did you mean 'model'?"),
+    ],
+)
+def test_a_mistake_is_one_sentence_with_a_suggestion(word: str, sentence: str) -> None:
+    with pytest.raises((ConfigError, ConfigCompositionException)) as caught:
+        compose("run", [word])
+    assert in_words(caught.value) == sentence
+
+
+SOURCE = """
+from __future__ import annotations
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+HALF = 0.5
+
+@dataclass(frozen=True)
+class Base:
+    kind: ClassVar[str] = "base"
+    width: float = 4 * HALF  # [m]
+
+@dataclass(frozen=True)
+class Model(Base):
+    needed: int
+    angle: float = math.pi / 2
+    pair: tuple[float, float] = (1.0, 2.0)
+    colour: Literal["red", "green"] = "red"
+    limit: int | None = None
+    inner: Base = Base()
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
+    """A module outside the tree, under a name no other test uses."""
+    name = f"outside_{request.node.name}"
+    (tmp_path / f"{name}.py").write_text(SOURCE.replace("needed: int", "needed: int = 0"))
+    monkeypatch.syspath_prepend(tmp_path)
+    return name
+
+
+def test_a_signature_outside_the_tree_is_read_with_its_base_class(package: str) -> None:
+    read = knobs(f"{package}.Model")
+    assert {name: knob.default for name, knob in read.items()} == {
+        "width": 2.0, "needed": 0, "angle": 1.5707963267948966, "pair": (1.0, 2.0),
+        "colour": "red", "limit": None, "inner": MISSING,
+    }  # fmt: skip
+    assert read["colour"].choices == ("red", "green")
+
+
+def test_a_tuple_stays_a_tuple_and_an_unshown_default_stays_the_targets_own(package: str) -> None:
+    config = OmegaConf.create({"model": {"_target_": f"{package}.Model", "pair": [3, 4]}})
+    expand(config)
+    model = build(plain(config))["model"]
+    assert model.pair == (3.0, 4.0)
+    assert model.inner.width == 2.0
+
+
+def test_a_value_outside_its_literal_is_refused(package: str) -> None:
+    config = OmegaConf.create({"model": {"_target_": f"{package}.Model", "colour": "gren"}})
+    expand(config)
+    with pytest.raises(ConfigError, match=r"model.colour is 'gren'; did you mean 'green'\?"):
+        check_values(config)
+
+
+def test_a_missing_value_is_asked_for_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "outside_needed.py").write_text("def load(path: str, rows: int = 3): return path, rows\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    config = OmegaConf.create({"scenario": {"_target_": "outside_needed.load"}})
+    expand(config)
+    with pytest.raises(ConfigError, match=r"scenario.path has no value; give one with scenario.path=..."):
+        build(plain(config))
+    config.scenario.path = "x.csv"
+    assert build(plain(config))["scenario"] == ("x.csv", 3)
+
+
+def test_a_target_that_does_not_exist_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"_target_ 'models.nowhere.Model' does not exist"):
+        knobs("models.nowhere.Model")

@@ -1,0 +1,57 @@
+"""Dependencies point one way, and the command line answers without the heavy ones."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ALLOWED = {
+    "models": {"models"},
+    "inference": {"inference", "models.program", "models.capability"},
+    "experiments": {"experiments", "inference", "models"},
+    "benchmarks": {"benchmarks", "experiments", "inference", "models"},
+}
+OURS = {"models", "inference", "experiments", "configs", "benchmarks", "tests", "examples"}
+
+
+def imports_of(file: Path) -> Iterator[str]:
+    """Dotted names that a file imports, wherever in the file."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{file}: imports of ours are absolute"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_dependencies_point_one_way(package: str) -> None:
+    files = list((ROOT / package).rglob("*.py"))
+    assert files
+    for file in files:
+        for name in imports_of(file):
+            if name.partition(".")[0] in OURS:
+                allowed = any(f"{name}.".startswith(f"{head}.") for head in ALLOWED[package])
+                assert allowed, f"{file.relative_to(ROOT)} imports {name}"
+
+
+HEAVY = ("torch", "pyro", "numba", "arviz", "matplotlib", "scipy")
+
+
+@pytest.mark.parametrize("words", [["--cfg", "job"], ["--help"]])
+def test_help_and_dry_run_import_nothing_heavy(words: list[str], tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom experiments.run import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        f"print('HEAVY', [name for name in {HEAVY} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert "num_steps" in done.stdout, done.stderr
+    assert done.stdout.rstrip().endswith("HEAVY []")
+    assert not list(tmp_path.iterdir()), "a dry run writes nothing"

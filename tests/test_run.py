@@ -1,0 +1,107 @@
+"""The command line: what a run leaves behind, what it repeats, and what it says when it fails."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.metrics import site_error
+from experiments.run import engine_seed, run
+from experiments.scenarios.toys import line, slot_road
+from inference.posterior import Posterior
+from models.program import InputError
+from models.toys.gaussian import ConjugateGaussian
+from tests.conftest import Command
+
+FAKE = ["--config-dir", "conf", "engine=fake"]
+
+
+def test_a_run_leaves_a_complete_folder_and_an_identical_one_is_skipped(launch: Command) -> None:
+    first = launch(*FAKE)
+    assert first.returncode == 0, first.stderr
+    (folder,) = Path("runs").iterdir()
+    assert {path.name for path in folder.iterdir()} == {
+        "manifest.json", "scores.json", "diagnostics.json", "posterior.npz", "posterior.json", "figures", "report.html",
+    }  # fmt: skip
+    assert folder.name.startswith("line-gaussian-fake-")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["seeds"] == {"run": 0, "engine": engine_seed(0)}
+    assert manifest["config"]["engine"]["num_draws"] == 200
+    assert {"python", "torch", "numpy"} <= manifest["versions"].keys()
+    assert {"date", "git", "hardware", "seconds", "scene", "identity"} <= manifest.keys()
+    report = (folder / "report.html").read_text()
+    assert "data:image/png;base64," in report
+    assert "http://" not in report and "https://" not in report
+    assert Posterior.load(folder).draws["beta"].shape == (2, 200, 2)
+
+    second = launch(*FAKE)
+    assert "done already" in second.stdout and "beta error" in second.stdout
+    assert Path("calls.txt").read_text().split() == [str(engine_seed(0))]
+    third = launch(*FAKE, "force=true")
+    assert third.returncode == 0, third.stderr
+    assert len(Path("calls.txt").read_text().split()) == 2
+    assert [path.name for path in Path("runs").iterdir()] == [folder.name]
+
+
+def test_a_misspelt_key_is_refused_before_anything_is_written(launch: Command) -> None:
+    done = launch(*FAKE, "engine.num_draw=5")
+    assert done.returncode == 2
+    assert done.stderr == "waybayes: engine has no knob 'num_draw'; did you mean 'num_draws'?\n"
+    assert not Path("runs").exists() and not Path("calls.txt").exists()
+
+
+def test_bad_input_is_one_sentence_and_leaves_nothing(launch: Command) -> None:
+    done = launch(*FAKE, "scenario.num=0")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "num is 0" in done.stderr
+    assert not list(Path("runs").iterdir())
+
+
+def test_a_failed_job_does_not_stop_the_sweep(launch: Command) -> None:
+    words = [*FAKE, "engine.fail_at=100", "engine.num_draws=100,200", "seed=0,1"]
+    done = launch("-m", *words)
+    assert done.returncode == 2
+    assert done.stderr.count("num_draws is 100; choose another") == 2
+    assert len(list(Path("runs").glob("line-gaussian-fake-*"))) == 2
+    calls = len(Path("calls.txt").read_text().split())
+    assert calls == 4
+    launch("-m", *words)  # resumes: only what failed runs again
+    assert len(Path("calls.txt").read_text().split()) == calls + 2
+
+
+def test_any_other_error_shows_its_traceback_and_the_run_it_belongs_to(launch: Command) -> None:
+    done = launch(*FAKE, "engine.style=angry")
+    assert done.returncode == 1
+    assert "Traceback" in done.stderr and "engine.style=angry failed" in done.stderr
+
+
+def test_a_folder_that_hides_our_packages_is_named(launch: Command) -> None:
+    Path("configs").mkdir()
+    Path("configs/__init__.py").touch()
+    done = launch(*FAKE)
+    assert done.returncode == 2
+    assert "the package 'configs'" in done.stderr and "hides it" in done.stderr
+
+
+def test_a_scenario_that_does_not_fit_the_model_is_refused() -> None:
+    with pytest.raises(InputError, match="ConjugateGaussian reads Readings, but the scenario gives Markings"):
+        run(slot_road, ConjugateGaussian(), lambda *_, seed: None)  # type: ignore[arg-type,return-value]
+
+
+def test_exact_draws_score_one_standard_deviation_on_average() -> None:
+    """The squared error of a calibrated posterior has mean 1; over S scenes of two independent
+    scores each its standard error is sqrt(2 / (2 S)), which for S = 200 is 0.07: four of them."""
+    squares = []
+    for seed in range(200):
+        scene = line(seed)
+        mean, covariance, _ = ConjugateGaussian().exact(scene.data)
+        draws = np.random.default_rng(seed).multivariate_normal(mean.numpy(), covariance.numpy(), size=(1, 2000))
+        squares.append(site_error(Posterior({"beta": draws}), scene)["beta_error_sd"] ** 2)
+    assert abs(np.mean(squares) - 1.0) < 4 * 0.07
+
+
+def test_the_engine_seed_is_a_child_of_the_runs_seed() -> None:
+    assert len({engine_seed(seed) for seed in range(100)} | set(range(100))) == 200

@@ -153,7 +153,7 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
         store.write_json(folder / "scores.json", result.scores)
         store.write_json(folder / "diagnostics.json", {"summary": result.diagnostics, "flags": result.flags})
         result.posterior.save(folder)
-        manifest = store.manifest(job.config, seeds, result.seconds, result.scene.info)
+        manifest = store.manifest(job.name, job.config, seeds, result.seconds, result.scene.info)
         write_report(folder, job.name, result, manifest)
         store.write_json(folder / "manifest.json", manifest)
     return result.scores

@@ -87,16 +87,19 @@ def is_done(folder: Path) -> bool:
     return (folder / "manifest.json").is_file()
 
 
-def manifest(config: dict[str, Any], seeds: dict[str, int], seconds: dict[str, float], info: Any) -> dict[str, Any]:
+def manifest(
+    name: str, config: dict[str, Any], seeds: dict[str, int], seconds: dict[str, float], info: Any
+) -> dict[str, Any]:
     """What it takes to understand and repeat a run.
 
+    name     of the run's folder, which ends in its identity when it started
     seeds    of the run and of the engine
     seconds  per stage
     info     of the scene
     """
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "identity": identity(config),
+        "run": name,
         "config": config,
         "seeds": seeds,
         "seconds": seconds,

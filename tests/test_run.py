@@ -29,9 +29,10 @@ def test_a_run_leaves_a_complete_folder_and_an_identical_one_is_skipped(launch: 
     assert folder.name.startswith("line-gaussian-fake-")
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["seeds"] == {"run": 0, "engine": engine_seed(0)}
+    assert manifest["run"] == folder.name
     assert manifest["config"]["engine"]["num_draws"] == 200
     assert {"python", "torch", "numpy"} <= manifest["versions"].keys()
-    assert {"date", "git", "hardware", "seconds", "scene", "identity"} <= manifest.keys()
+    assert {"date", "git", "hardware", "seconds", "scene"} <= manifest.keys()
     report = (folder / "report.html").read_text()
     assert "data:image/png;base64," in report
     assert "http://" not in report and "https://" not in report

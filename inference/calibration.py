@@ -7,7 +7,8 @@ Simulation-based calibration (Talts et al. 2018): with z, y ~ p(z, y) and z_1..z
 Joint test (Geweke 2004): a transition that leaves p(z | y) invariant, followed by fresh data
 y ~ p(y | z), leaves the joint density p(z, y) invariant. Many short chains start from exact draws of
 the joint density and move on together (Gandy & Scott 2020), so that their differences from the
-start are independent and the z-scores need no estimate of autocorrelation.
+start are independent and the z-scores need no estimate of autocorrelation. Functionals are measured
+between the transition and the fresh data: a transition that ignores the data shows only there.
 
 A functional maps latents {site: (B, *event)} to (B,), as arrays or tensors. The functional
 `log_joint` is always added: it sees the data, and is the most telling one (Modrák et al. 2023).
@@ -65,19 +66,24 @@ def ranks(
     num: int,
     num_draws: int,
     seed: int,
+    batched: bool = False,
 ) -> Ranks:
     """Ranks of `num` simulated truths, each among `num_draws` evenly spaced draws of the engine.
 
-    blank  evidence whose observed fields are None
+    blank    evidence whose observed fields are None
+    batched  one call for all scenes, evidence (num, *event), and chain i of the posterior is scene i
+
     Ties, as discrete functionals have, are broken at random. Chains must be thinned or long enough
     for the draws to be nearly independent."""
     scene_seed, *seeds = _seeds(seed, 1 + 2 * num)
     scenes = simulate(model, blank, num=num, seed=scene_seed)
+    together = _split(engine(model, observe(blank, scenes)[0], seeds[0])) if batched else None
     found: dict[str, list[int]] = {name: [] for name in (*functionals, "log_joint")}
     for scene in range(num):
         evidence, truth = observe(blank, {name: value[scene] for name, value in scenes.items()})
         engine_seed, tie_seed = seeds[2 * scene : 2 * scene + 2]
-        draws = engine(model, evidence, engine_seed).resample(num_draws, tie_seed)
+        posterior = together[scene] if together else engine(model, evidence, engine_seed)
+        draws = posterior.resample(num_draws, tie_seed)
         ties = np.random.default_rng(tie_seed)
         # the truth joins its draws as number 0, so that both are treated alike
         joined = {n: torch.cat([v[None], torch.from_numpy(draws[n]).to(v.dtype)]) for n, v in truth.items()}
@@ -85,6 +91,12 @@ def ranks(
             below, equal = int((values[1:] < values[0]).sum()), int((values[1:] == values[0]).sum())
             found[name].append(below + int(ties.integers(0, equal + 1)))
     return Ranks({name: np.array(values) for name, values in found.items()}, num_draws)
+
+
+def _split(posterior: Posterior) -> list[Posterior]:
+    """Each chain as a posterior of its own."""
+    num_chains = posterior.shape[0]
+    return [Posterior({n: v[c : c + 1] for n, v in posterior.draws.items()}) for c in range(num_chains)]
 
 
 def geweke(
@@ -107,9 +119,9 @@ def geweke(
     sums = {name: np.zeros(num) for name in start}
     for move_seed, data_seed in zip(seeds[::2], seeds[1::2], strict=True):
         latents = transition(latents, evidence, move_seed)
-        evidence = predict(model, latents, blank, seed=data_seed)
         for name, values in _evaluate(functionals, model, latents, evidence).items():
             sums[name] += values
+        evidence = predict(model, latents, blank, seed=data_seed)
     return {name: z_score(sums[name] / num_steps - start[name]) for name in start}
 
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from inference import weights
+from inference.polish import polish as polish_state
 from inference.posterior import Posterior, Snapshots
 from inference.progress import Progress, announce
 from models.capability import HasMoves, Kernel, Move, kernel_types
@@ -58,6 +59,7 @@ class Chains(NamedTuple):
     log_terms: Callable[[], tuple[Array, Array]]  # (C,) log prior, (C,) log likelihood
     choose: Callable[[Array], None]
     best: Callable[[], tuple[dict[str, Array], float]]
+    polish: Callable[[], None]  # climb from the best state
     counts: Callable[[], Array]  # (M, 3)
     names: tuple[str, ...]
 
@@ -149,13 +151,19 @@ def _batched(model: HasMoves, evidence: Any, latents: Latents, rule: int, thin: 
     remember()
     log_terms = lambda: (state.log_prior.numpy(), state.log_likelihood.numpy())  # noqa: E731
     names = tuple(move.name for move in moves)
-    return Chains(advance, log_terms, choose, lambda: (top[0], top[1]), lambda: counts, names)
+
+    def refuse() -> None:
+        raise InputError(f"polish=true needs a model with a kernel, but {type(model).__name__} has none")
+
+    return Chains(advance, log_terms, choose, lambda: (top[0], top[1]), refuse, lambda: counts, names)
 
 
 # Whole chains in machine code
 
 
-def _chain(propose, evaluate, commit, z, log_terms, best, uniforms, temperatures, setup, floats, ints, cache, draws, counts):  # type: ignore[no-untyped-def]  # noqa: E501
+def _chain(
+    propose, evaluate, commit, z, log_terms, best, uniforms, temperatures, setup, floats, ints, cache, draws, counts
+):  # type: ignore[no-untyped-def]  # noqa: E501
     """Run one chain for len(temperatures) steps, in place.
 
     z (D,) state; log_terms (2,) its log prior and log likelihood; best (D + 1,) best state and its log joint
@@ -253,8 +261,14 @@ def _start_compiled(
         row = best[best[:, -1].argmax()]
         return kernel.unpack(row[:-1]), float(row[-1])
 
+    def climb() -> None:
+        if kernel.refit is None:
+            raise InputError("polish=true needs a kernel with edits and a refit, and this model's has none")
+        row = int(best[:, -1].argmax())
+        best[row, :-1], best[row, -1] = polish_state(kernel, best[row, :-1])
+
     terms_now = lambda: (log_terms[:, 0], log_terms[:, 1])  # noqa: E731
-    return Chains(advance, terms_now, choose, top, lambda: counts.sum(0), kernel.move_names)
+    return Chains(advance, terms_now, choose, top, climb, lambda: counts.sum(0), kernel.move_names)
 
 
 # The engine
@@ -290,6 +304,7 @@ def run(
     acceptance: Literal["exact", "paper", "printed"] = "exact",
     start_temperature: float = 1.0,
     resample: bool = False,
+    polish: bool = False,
     path: Literal["auto", "compiled", "batched"] = "auto",
     num_workers: int = 1,
     progress: bool = False,
@@ -300,6 +315,7 @@ def run(
                  the model's data-driven start
     thin         keep every thin-th state after the warm-up; warmup = num_steps keeps the last state
     resample     resample chains between themselves while they anneal
+    polish       climb greedily from the best state over edits of the structure (the estimate, not the draws)
     num_workers  threads of the compiled path; the draws do not depend on it
 
     Raises InputError where the model lacks moves, a start or a kernel that is asked for."""
@@ -341,6 +357,9 @@ def run(
                 chains.choose(weights.systematic(heat * chains.log_terms()[1], num_chains, rng.random()))
             shots.append(_snapshot(chains, last, began))
             bar.advance(len(part))
+    if polish:
+        chains.polish()
+        shots.append(_snapshot(chains, num_steps, began))
     return _posterior(model, chains, draws, shots, time.perf_counter() - began)
 
 

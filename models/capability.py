@@ -74,6 +74,10 @@ class Kernel(NamedTuple):
         out = (log prior, log likelihood); may reuse what the cache holds of the current state
     commit(cache)
         the state evaluated last becomes the current one
+    edit(index, z, floats, z_new) -> applies
+        edit number `index` of the structure, for a greedy search
+    refit(z, floats, ints, cache)
+        one Gauss-Newton step of the continuous numbers of the state evaluated last, in place
     """
 
     move_names: tuple[str, ...]
@@ -88,7 +92,9 @@ class Kernel(NamedTuple):
     commit: Any
     pack: Callable[[dict[str, Any]], np.ndarray]  # {site: (B, *event)} -> (B, size)
     unpack: Callable[[np.ndarray], dict[str, np.ndarray]]  # (*batch, size) -> {site: (*batch, *event)}
-    improve: Callable[..., Any] | None = None
+    edit: Any = None  # where the model has edits
+    refit: Any = None
+    num_edits: int = 0
 
 
 def kernel_types() -> dict[str, Any]:
@@ -101,6 +107,8 @@ def kernel_types() -> dict[str, Any]:
         "propose": boolean(int64, vector, vector, vector, index, vector, vector, vector),
         "evaluate": void(vector, vector, index, vector, vector),
         "commit": void(vector),
+        "edit": boolean(int64, vector, vector, vector),
+        "refit": void(vector, vector, index, vector),
         "vector": vector,
         "index": index,
         "function": types.FunctionType,

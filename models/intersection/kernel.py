@@ -22,7 +22,8 @@ from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
 from models.intersection.halves import smooth
 from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS
 from models.intersection.packing import ARM, ENTRIES, EXITS, HEAD, MAX_ARMS, SIZE, pack, unpack
-from models.intersection.prior import log_prior
+from models.intersection.prior import GAP_MAX, log_prior
+from models.intersection.refit import EDITS_PER_ARM, FREE, edit, quadratic_model, solve_spd, take_step
 from models.intersection.split import (
     NUM_CELLS,
     NUM_SUMS,
@@ -125,9 +126,8 @@ def point_score(z, floats, ints, counts):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
-def fill_row(coef, entries, halves, side, cx, cy, arm, summed, scatter, row, lane):  # type: ignore[no-untyped-def]
+def fill_row(coef, first, last, side, cx, cy, arm, summed, scatter, row, lane):  # type: ignore[no-untyped-def]
     """Costs of the halves of one side with one arm."""
-    first, last = (0, entries) if side > 0 else (entries, halves)
     if (arm[2] if side > 0 else arm[3]) < 0.5:
         row[first:last] = density.NO_LANE
         return
@@ -190,6 +190,23 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     out[1] += density.sum_arms(rows[1], pick, num, entries, halves, out_lanes, stray, log_clutter, log_kept)
 
 
+def refit(z, floats, ints, cache):  # type: ignore[no-untyped-def]
+    """One Gauss-Newton step of the continuous numbers, in place; the cache holds z evaluated last."""
+    kind, halves, entries = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES]
+    which, _, _, rows, _, room = memory(cache, halves)
+    if kind == HALF:
+        coef = coefficients_at(cell_of(z[1], z[2]), floats, ints, room)
+        stray = np.full(halves, density.NO_LANE)
+    else:
+        coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
+        stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
+    size = 2 + FREE * int(z[0])
+    hessian, gradient = np.empty((size, size)), np.empty(size)
+    quadratic_model(z, coef, entries, stray, rows[1], rows[2], which[1], floats, hessian, gradient)
+    if solve_spd(hessian, gradient, size):
+        take_step(z, gradient, floats[GAP_MAX])
+
+
 def commit(cache):  # type: ignore[no-untyped-def]
     """Keep the rows evaluated last."""
     n = MAX_ARMS
@@ -198,11 +215,11 @@ def commit(cache):  # type: ignore[no-untyped-def]
 
 
 @lru_cache(maxsize=1)
-def compiled() -> tuple[Any, Any, Any]:
-    """(propose, evaluate, commit) with explicit signatures, from the disk cache where possible."""
+def compiled() -> dict[str, Any]:
+    """The kernel's functions with explicit signatures, from the disk cache where possible."""
     types = kernel_types()
-    build = lambda name, function: nb.njit(types[name], cache=True, error_model="numpy")(function)  # noqa: E731
-    return build("propose", moves.propose), build("evaluate", evaluate), build("commit", commit)
+    functions = {"propose": moves.propose, "evaluate": evaluate, "commit": commit, "edit": edit, "refit": refit}
+    return {n: nb.njit(types[n], cache=True, error_model="numpy")(f) for n, f in functions.items()}
 
 
 def settings(model: Junction) -> Array:
@@ -247,11 +264,14 @@ def junction_kernel(model: Junction, evidence: JunctionEvidence) -> Kernel:
         floats=floats,
         ints=ints,
         cache_size=int(memory_size(ints)),
-        propose=compiled()[0],
-        evaluate=compiled()[1],
-        commit=compiled()[2],
+        propose=compiled()["propose"],
+        evaluate=compiled()["evaluate"],
+        commit=compiled()["commit"],
         pack=lambda latents: pack(latents, constants, evidence.origin),
         unpack=lambda z: unpack(z, constants, evidence.origin),
+        edit=compiled()["edit"],
+        refit=compiled()["refit"] if model.likelihood != "point" else None,
+        num_edits=MAX_ARMS * EDITS_PER_ARM,
     )
 
 
@@ -263,7 +283,7 @@ def move_table(model: Junction) -> dict[int, float]:
 @lru_cache(maxsize=1)
 def _propose_rows() -> Any:
     """`propose` over rows of states; compiled once."""
-    propose = compiled()[0]
+    propose = compiled()["propose"]
 
     @nb.njit
     def rows(kind, z, u, floats, ints, z_new, u_new, log_q, valid):  # type: ignore[no-untyped-def]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @lru_cache(maxsize=1)
 def _likelihood_rows() -> Any:
-    evaluate = compiled()[1]
+    evaluate = compiled()["evaluate"]
 
     @nb.njit
     def rows(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
@@ -52,14 +52,18 @@ class TracksOnLanes(TorchDistribution):
         super().__init__(num_arms.shape, torch.Size([3, len(evidence.s)]), validate_args=False)
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> TracksOnLanes:
-        wide = {
-            n: v.expand(torch.Size(batch_shape) + v.shape[len(self.batch_shape) :]) for n, v in self.latents.items()
-        }
+        own = len(self.batch_shape)
+        wide = {n: v.expand(torch.Size(batch_shape) + v.shape[own:]) for n, v in self.latents.items()}
         arms = {n: v for n, v in wide.items() if n not in ("num_arms", "centre")}
         return TracksOnLanes(self.model, self.evidence, wide["num_arms"], wide["centre"], arms)
 
+    def _rows(self) -> dict[str, Tensor]:
+        """The latents with all batch dimensions in one."""
+        own = len(self.batch_shape)
+        return {n: v.reshape((-1, *v.shape[own:])) for n, v in self.latents.items()}
+
     def _packed(self) -> np.ndarray:
-        flat = {n: v.reshape((-1,) + v.shape[len(self.batch_shape) :]).numpy() for n, v in self.latents.items()}
+        flat = {n: v.numpy() for n, v in self._rows().items()}
         return pack(flat, self.model.constants, self.evidence.origin)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -87,11 +91,9 @@ class TracksOnLanes(TorchDistribution):
                 "simulate with likelihood='exact'"
             )
         wide = self.expand(torch.Size(sample_shape) + self.batch_shape) if len(sample_shape) else self
-        arms = {n: v.reshape((-1,) + v.shape[len(wide.batch_shape) :]) for n, v in wide.latents.items()}
-        points = [
-            _draw_points(wide.model, wide.evidence, {n: v[b] for n, v in arms.items()})
-            for b in range(len(arms["num_arms"]))
-        ]
+        rows = wide._rows()
+        each = ({n: v[b] for n, v in rows.items()} for b in range(len(rows["num_arms"])))
+        points = [_draw_points(wide.model, wide.evidence, one) for one in each]
         return torch.stack(points).reshape(wide.batch_shape + torch.Size([3, len(wide.evidence.s)]))
 
 
@@ -108,10 +110,10 @@ def _draw_points(model: Junction, evidence: JunctionEvidence, one: dict[str, Ten
     for side, lanes in ((incoming, one["entries"]), (~incoming, one["exits"])):
         label = active * lanes  # lanes per arm
         lost = lost | (side & (label.sum() == 0))
-        arm[side] = (
-            torch.multinomial(label.clamp(min=1e-300), int(side.sum()), replacement=True) if side.any() else arm[side]
-        )
-        lane[side] = torch.floor(torch.rand(int(side.sum())) * lanes[arm[side]])
+        count = int(side.sum())
+        if count:
+            arm[side] = torch.multinomial(label.clamp(min=1e-300), count, replacement=True)
+            lane[side] = torch.floor(torch.rand(count) * lanes[arm[side]])
     sign = torch.where(incoming, 1.0, -1.0)
     angle, bend = field("angle")[arm], field("bend")[arm]
     offset = field("shift")[arm] + sign * (one["gap"][arm] / 2 + (lane + 0.5) * field("width")[arm])
@@ -126,7 +128,6 @@ def _draw_points(model: Junction, evidence: JunctionEvidence, one: dict[str, Ten
     heading = angle[half] + torch.where(incoming, math.pi, 0.0)[half] + bend[half] * (s - CHORD / 2)
     heading = heading + noise.heading * torch.randn(len(s))
     radius, turn = model.clutter_radius * torch.rand(len(s)).sqrt(), 2 * math.pi * torch.rand(len(s))
-    stray = torch.stack(
-        [radius * torch.cos(turn), radius * torch.sin(turn), 2 * math.pi * torch.rand(len(s)) - math.pi]
-    )
+    anywhere = 2 * math.pi * torch.rand(len(s)) - math.pi
+    stray = torch.stack([radius * torch.cos(turn), radius * torch.sin(turn), anywhere])
     return torch.where(lost[half], stray, torch.stack([x, y, heading]))

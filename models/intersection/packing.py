@@ -38,7 +38,7 @@ def pack(latents: dict[str, Any], constants: dict[str, float], origin: NDArray[n
 
 def unpack(z: NDArray[np.float64], constants: dict[str, float], origin: NDArray[np.float64]) -> dict[str, Any]:
     """(*batch, SIZE) to {site: (*batch, *event)}, the inverse of `pack`."""
-    slots = z[..., HEAD:].reshape(z.shape[:-1] + (MAX_ARMS, ARM))
+    slots = z[..., HEAD:].reshape((*z.shape[:-1], MAX_ARMS, ARM))
     latents: dict[str, Any] = {"centre": z[..., 1:HEAD] + origin, "num_arms": np.rint(z[..., 0]).astype(np.int64)}
     for j, name in enumerate(FIELDS):
         if name not in constants:

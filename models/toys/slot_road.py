@@ -137,7 +137,7 @@ class SlotRoad:
         old_knot, old_rate = knot[rows, last], rate[rows, last]
         knot[rows, last] = u[:, 2] * self.length
         rate[rows, last] = normal.icdf(u[:, 3].clamp(1e-15, 1 - 1e-15))
-        new_knot, new_rate = knot[rows, last].clone(), rate[rows, last].clone()
+        new_rate = rate[rows, last].clone()
         for values in (knot, rate):
             values[rows[birth], last[birth]], values[rows[birth], place[birth]] = (
                 values[rows[birth], place[birth]],

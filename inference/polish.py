@@ -1,0 +1,69 @@
+"""Greedy search over structures: try every edit, refit the rest by Gauss-Newton, keep what is better.
+
+Not MCMC: it climbs to a mode of p(z | y) near a chain's best state. An edit costs a few refits, so that a
+sweep over all edits is far cheaper than the random steps that would find one of them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.capability import Kernel, kernel_types
+
+REFITS = 3  # Gauss-Newton steps after an edit
+SWEEPS = 6  # at most
+HOPELESS = 400.0  # nats below the best after the first refit: give the edit up
+WORTH = 0.5  # nats that make another sweep worthwhile
+
+
+def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, score):  # type: ignore[no-untyped-def]
+    """Improve z in place; score (1,) its log joint."""
+    trial, best, out = z.copy(), z.copy(), np.zeros(2)
+    evaluate(z, floats, ints, cache, out)
+    commit(cache)
+    score[0] = out[0] + out[1]
+    for _ in range(SWEEPS):
+        before = score[0]
+        for index in range(-1, num_edits):
+            if index < 0:
+                trial[:] = z
+            elif not edit(index, z, floats, trial):
+                continue
+            top = -np.inf
+            for step in range(REFITS + 1):
+                evaluate(trial, floats, ints, cache, out)
+                value = out[0] + out[1]
+                if value > top:
+                    top, best[:] = value, trial
+                if step == REFITS or not np.isfinite(value) or (step > 0 and top < score[0] - HOPELESS):
+                    break
+                refit(trial, floats, ints, cache)
+            if top > score[0] + 1e-6:
+                score[0], z[:] = top, best
+                evaluate(z, floats, ints, cache, out)
+                commit(cache)
+        if score[0] < before + WORTH:
+            break
+
+
+@lru_cache(maxsize=1)
+def _compiled_climb() -> Any:
+    import numba as nb
+
+    types = kernel_types()
+    functions = (types["function"](types[name]) for name in ("edit", "refit", "evaluate", "commit"))
+    vector, index = types["vector"], types["index"]
+    signature = nb.void(*functions, nb.int64, vector, vector, index, vector, vector)
+    return nb.njit(signature, cache=True, nogil=True)(_climb)
+
+
+def polish(kernel: Kernel, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The mode near a packed state (D,) and its log joint. Needs a kernel with edits and a refit."""
+    z, score = z.copy(), np.empty(1)
+    cache = np.zeros(kernel.cache_size)
+    functions = (kernel.edit, kernel.refit, kernel.evaluate, kernel.commit)
+    _compiled_climb()(*functions, kernel.num_edits, z, kernel.floats, kernel.ints, cache, score)
+    return z, float(score[0])

@@ -47,6 +47,8 @@ def marginals(posterior: Posterior, scene: Scene, *, most: int = 8) -> dict[str,
             bins=_integer_bins(posterior.model_index),
         )
         axes[-1][0].set_ylabel("model index")
+        axes[-1][0].yaxis.get_major_locator().set_params(integer=True)
+        axes[-1][1].xaxis.get_major_locator().set_params(integer=True)
     axes[-1][0].set_xlabel("draw")
     axes[-1][1].set_xlabel("value")
     return {"marginals": figure}

@@ -160,7 +160,7 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
 
 
 def show(scores: dict[str, float], folder: Path) -> None:
-    """Print the scores and where the report is."""
+    """Print the scores, what speaks against the draws, and where the report is."""
     from rich.console import Console
     from rich.table import Table
 
@@ -173,6 +173,11 @@ def show(scores: dict[str, float], folder: Path) -> None:
     console = Console()
     if scores:
         console.print(table)
+    flags = store.read_json(folder / "diagnostics.json")["flags"]
+    for flag in flags[:3]:
+        console.print(f"flag       {flag}", style="yellow", soft_wrap=True, markup=False, highlight=False)
+    if len(flags) > 3:
+        console.print(f"           and {len(flags) - 3} more flags in the report", style="yellow")
     console.print(f"report     {folder / 'report.html'}", soft_wrap=True, highlight=False)
 
 

@@ -25,16 +25,19 @@ def line(seed: int = 0, num: int = 30, noise_std: float = 0.5) -> Scene:
     return _simulated("line", model, Readings(torch.linspace(-1.0, 1.0, num, dtype=torch.float64), None), seed)
 
 
-def slot_road(seed: int = 0, num: int = 60, num_knots: int | None = 2, noise_std: float = 0.1) -> Scene:
+def slot_road(
+    seed: int = 0, num: int = 60, num_knots: int | None = 2, noise_std: float = 0.1, rate_std: float = 1e-3
+) -> Scene:
     """Detections of one marking drawn from the prior of SlotRoad.
 
     num        detections, evenly spread over the visible road
     num_knots  active knots; None draws their number from the prior
     noise_std  of the detector [m]; the model's own default is the same
+    rate_std   of the curvature rates [1/m^2]; the model's own default is the same
 
     Raises InputError for no detections and for more knots than the model has slots."""
     _check_num("slot_road", num)
-    road = SlotRoad(noise_std=noise_std)
+    road = SlotRoad(noise_std=noise_std, rate_std=rate_std)
     if num_knots is not None and not 0 <= num_knots <= road.max_knots:
         raise InputError(f"scenario slot_road: num_knots is {num_knots}; choose 0 to {road.max_knots}")
     s = torch.linspace(0.0, road.length, num, dtype=torch.float64)

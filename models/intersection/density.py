@@ -41,6 +41,7 @@ from models.intersection.moments import (
 EXACT, HALF, POINT = 0, 1, 2
 LIKELIHOODS = {"exact": EXACT, "half": HALF, "point": POINT}
 NEGLIGIBLE = 37.0  # exp(-37) is below the resolution of a double next to 1
+FAR_LANE = 18.0  # a lane with less than exp(-18) of the closest one's weight is left out of the sum
 NO_LANE = 1e18  # cost where an arm has no lane of the driving direction
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 
@@ -58,11 +59,11 @@ def scatter_row(coef, angle, bend, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def mean_row(coef, first, last, side, cx, cy, arm, scatter, cost, lane):  # type: ignore[no-untyped-def]
+def mean_row(coef, first, last, side, cx, cy, arm, scatter, row):  # type: ignore[no-untyped-def]
     """Add the cost of the mean residuals to the closest lane, halves first:last of one side.
 
     arm = (angle, gap, entries, exits, width, bend, shift); side +1 entries, -1 exits.
-    cost, lane  (H,) filled between first and last"""
+    row  (3, H) cost, lane and residual from the middle of the lane [m], filled between first and last"""
     angle, gap, width, bend, shift = arm[0], arm[1], arm[4], arm[5], arm[6]
     num = arm[2] if side > 0 else arm[3]
     dx, dy = math.cos(angle), math.sin(angle)
@@ -80,43 +81,55 @@ def mean_row(coef, first, last, side, cx, cy, arm, scatter, cost, lane):  # type
         p = coef[PHI, h] - heading - bend * coef[S, h]
         p -= 2.0 * math.pi * math.floor(p * turn + 0.5)
         mean = coef[W_ACROSS, h] * r * r + coef[W_ALONG, h] * v * v + coef[W_HEADING, h] * p * p
-        cost[h] = scatter[h] + 0.5 * mean
-        lane[h] = k
+        row[0, h] = scatter[h] + 0.5 * mean
+        row[1, h], row[2, h] = k, r
 
 
 @nb.njit(cache=True, error_model="numpy")
-def sum_lanes_row(coef, first, last, side, cx, cy, arm, cost, lane):  # type: ignore[no-untyped-def]
-    """Turn the cost of the closest lane into -log sum over the arm's lanes of exp(-cost)."""
-    width, num = arm[4], int(arm[2] if side > 0 else arm[3])
-    if num < 2:
-        return
-    dx, dy = math.cos(arm[0]), math.sin(arm[0])
-    axis = -dy * cx + dx * cy + arm[6]
-    inner = 0.5 * arm[1] + 0.5 * width
+def sum_lanes_row(coef, first, last, width, num, stray, row):  # type: ignore[no-untyped-def]
+    """Turn the cost of the closest of `num` lanes into -log sum over the lanes of exp(-cost).
+
+    Halves that are far better off as stray ones are left alone: what they add is below resolution."""
+    top = num - 1.0
     for h in range(first, last):
-        k = int(lane[h])
-        across = -dy * coef[X, h] + dx * coef[Y, h] - axis - arm[5] * coef[T, h]
-        r = side * across - inner - k * width
-        half_weight = 0.5 * coef[W_ACROSS, h] * width
+        if row[0, h] > stray[h] + 3.0 * NEGLIGIBLE:
+            continue
+        unit, k, r = 0.5 * coef[W_ACROSS, h] * width, row[1, h], row[2, h]
+        up = unit * (width - 2.0 * r) if k < top else FAR_LANE
+        down = unit * (width + 2.0 * r) if k > 0.0 else FAR_LANE
+        if up >= FAR_LANE and down >= FAR_LANE:
+            continue
         extra = 0.0
-        for step in (-1, 1):
-            j = 1
-            while 0 <= k + step * j < num:
-                more = half_weight * j * (j * width - 2.0 * step * r)
-                if more > NEGLIGIBLE:
+        for side in range(2):
+            sign, room = (1.0, int(top - k)) if side == 0 else (-1.0, int(k))
+            for j in range(1, room + 1):
+                more = unit * j * (j * width - 2.0 * sign * r)
+                if more > FAR_LANE:
                     break
                 extra += math.exp(-more)
-                j += 1
-        if extra > 0.0:
-            cost[h] -= math.log1p(extra)
+        row[0, h] -= math.log1p(extra)
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def two_lowest(rows, pick, num_arms, low, second):  # type: ignore[no-untyped-def]
+    """The lowest and the second lowest cost of every half over the arms, (H,)."""
+    low[:] = NO_LANE
+    second[:] = NO_LANE
+    for a in range(num_arms):
+        row = rows[int(pick[a]), a, 0]
+        for h in range(len(low)):
+            above = max(low[h], row[h])
+            low[h] = min(low[h], row[h])
+            second[h] = min(second[h], above)
 
 
 @nb.njit(cache=True, error_model="numpy")
-def sum_arms(rows, pick, num_arms, first, last, num_lanes, clutter, log_clutter, log_kept):  # type: ignore[no-untyped-def]
+def sum_arms(rows, pick, num_arms, first, last, num_lanes, low, second, clutter, log_clutter, log_kept):  # type: ignore[no-untyped-def]
     """Log likelihood of halves first:last of one side, labels summed out.
 
-    rows         (2, A, H) cost per arm, lanes summed; rows[pick[a], a] is the one that counts
+    rows         (2, A, 3, H) cost, lane, residual per arm; rows[pick[a], a] is the one that counts
     num_lanes    lanes of this side on all arms
+    low, second  (H,) from `two_lowest`
     clutter      (H,) -log p_0 minus the Gaussian normaliser of the half
     log_clutter  log of the share of clutter, log_kept of the rest"""
     if num_lanes < 0.5:  # nowhere to be: every half is stray
@@ -124,29 +137,19 @@ def sum_arms(rows, pick, num_arms, first, last, num_lanes, clutter, log_clutter,
     label = log_kept - math.log(num_lanes)
     total = 0.0
     for h in range(first, last):
-        low, second = NO_LANE, NO_LANE
-        for a in range(num_arms):
-            value = rows[int(pick[a]), a, h]
-            if value < low:
-                low, second = value, low
-            elif value < second:
-                second = value
-        low -= label
-        second -= label
-        stray = clutter[h] - log_clutter
-        best = min(low, stray)
-        if max(low, stray) - best > NEGLIGIBLE and second - best > NEGLIGIBLE:
-            total -= best
-            continue
-        share = math.exp(best - stray)
-        for a in range(num_arms):
-            share += math.exp(best - (rows[int(pick[a]), a, h] - label))
-        total += math.log(share) - best
+        lane, stray = low[h] - label, clutter[h] - log_clutter
+        best = min(lane, stray)
+        total -= best
+        if max(lane, stray) - best < NEGLIGIBLE or second[h] - label - best < NEGLIGIBLE:
+            share = math.exp(best - stray)
+            for a in range(num_arms):
+                share += math.exp(best - (rows[int(pick[a]), a, 0, h] - label))
+            total += math.log(share)
     return total
 
 
 @nb.njit(cache=True, error_model="numpy")
-def closest_arms(rows, lanes, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
+def closest_arms(rows, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
     """Score of halves first:last of one side with the closest lane each and multinomial counts."""
     if last == first:
         return 0.0
@@ -157,11 +160,11 @@ def closest_arms(rows, lanes, pick, num_arms, first, last, num_lanes, counts):  
     for h in range(first, last):
         low, arm = math.inf, 0
         for a in range(num_arms):
-            value = rows[int(pick[a]), a, h]
+            value = rows[int(pick[a]), a, 0, h]
             if value < low:
                 low, arm = value, a
         total -= low
-        counts[arm, int(lanes[int(pick[arm]), arm, h])] += 1.0
+        counts[arm, int(rows[int(pick[arm]), arm, 1, h])] += 1.0
     return total + multinomial(counts, num_lanes)
 
 

@@ -22,7 +22,7 @@ from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
 from models.intersection.halves import smooth
 from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS
 from models.intersection.packing import ARM, ENTRIES, EXITS, HEAD, MAX_ARMS, SIZE, pack, unpack
-from models.intersection.prior import GAP_MAX, log_prior
+from models.intersection.prior import GAP_MAX, log_prior, prior_numbers
 from models.intersection.refit import EDITS_PER_ARM, FREE, edit, quadratic_model, solve_spd, take_step
 from models.intersection.split import (
     NUM_CELLS,
@@ -54,7 +54,7 @@ MAX_COUNTS = 10  # lanes of a side, at most
 def memory_size(ints):  # type: ignore[no-untyped-def]
     """Length of the cache for this evidence."""
     halves = ints[NUM_HALVES]
-    size = MAX_ARMS * (4 + 2 * KEY + 2 * TURN + 6 * halves + MAX_COUNTS)
+    size = MAX_ARMS * (4 + 2 * KEY + 2 * TURN + 8 * halves + MAX_COUNTS) + 2 * halves
     if ints[LIKELIHOOD] == HALF:
         size += NUM_CELLS + (NUM_MOMENTS + 5) * halves + NUM_CELLS * NUM_COEFFICIENTS * halves
     return size
@@ -63,7 +63,7 @@ def memory_size(ints):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True)
 def memory(cache, halves):  # type: ignore[no-untyped-def]
     """Named views of the cache: which row of each slot is current and which is evaluated, for rows and for
-    their scatter; the numbers each was computed from; scatter, costs and lanes (2, A, H); counts; the rest."""
+    their scatter; the numbers each was computed from; scatter (2, A, H); cost, lane, residual (2, A, 3, H); counts; the rest."""
     n = MAX_ARMS
     which = cache[: 4 * n].reshape((4, n))
     o = 4 * n
@@ -71,10 +71,12 @@ def memory(cache, halves):  # type: ignore[no-untyped-def]
     o += 2 * n * KEY
     turns = cache[o : o + 2 * n * TURN].reshape((2, n, TURN))
     o += 2 * n * TURN
-    rows = cache[o : o + 6 * n * halves].reshape((3, 2, n, halves))
+    scatter = cache[o : o + 2 * n * halves].reshape((2, n, halves))
+    o += 2 * n * halves
+    rows = cache[o : o + 6 * n * halves].reshape((2, n, 3, halves))
     o += 6 * n * halves
     counts = cache[o : o + n * MAX_COUNTS].reshape((n, MAX_COUNTS))
-    return which, keys, turns, rows, counts, cache[o + n * MAX_COUNTS :]
+    return which, keys, turns, scatter, rows, counts, cache[o + n * MAX_COUNTS :]
 
 
 @nb.njit(cache=True)
@@ -126,18 +128,19 @@ def point_score(z, floats, ints, counts):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
-def fill_row(coef, first, last, side, cx, cy, arm, summed, scatter, row, lane):  # type: ignore[no-untyped-def]
-    """Costs of the halves of one side with one arm."""
-    if (arm[2] if side > 0 else arm[3]) < 0.5:
-        row[first:last] = density.NO_LANE
+def fill_side(coef, first, last, side, z, arm, stray, scatter, row):  # type: ignore[no-untyped-def]
+    """Costs of the halves of one side with one arm; lanes are summed where there are stray halves."""
+    num = arm[2] if side > 0 else arm[3]
+    if num < 0.5:
+        row[0, first:last] = density.NO_LANE
         return
-    density.mean_row(coef, first, last, side, cx, cy, arm, scatter, row, lane)
-    if summed:
-        density.sum_lanes_row(coef, first, last, side, cx, cy, arm, row, lane)
+    density.mean_row(coef, first, last, side, z[1], z[2], arm, scatter, row)
+    if len(stray) > 0:
+        density.sum_lanes_row(coef, first, last, arm[4], num, stray, row)
 
 
 @nb.njit(cache=True)
-def update_arm(a, z, coef, cell, ints, which, keys, turns, rows):  # type: ignore[no-untyped-def]
+def update_arm(a, z, coef, stray, cell, entries, which, keys, turns, scatter, rows):  # type: ignore[no-untyped-def]
     """Make sure that a slot's row for z is at hand, computing only what changed."""
     arm = z[HEAD + a * ARM : HEAD + (a + 1) * ARM]
     row = int(which[0, a])
@@ -148,17 +151,16 @@ def update_arm(a, z, coef, cell, ints, which, keys, turns, rows):  # type: ignor
     if known:
         return
     row, turn = 1 - row, int(which[2, a])
-    halves, entries = ints[NUM_HALVES], ints[NUM_ENTRIES]
     if not (turns[turn, a, 0] == arm[0] and turns[turn, a, 1] == arm[5] and turns[turn, a, 2] == cell):
         turn = 1 - turn
         turns[turn, a, 0], turns[turn, a, 1], turns[turn, a, 2] = arm[0], arm[5], cell
-        density.scatter_row(coef, arm[0], arm[5], rows[0, turn, a])
+        density.scatter_row(coef, arm[0], arm[5], scatter[turn, a])
     which[1, a], which[3, a] = row, turn
     keys[row, a, 0], keys[row, a, 1] = z[1], z[2]
-    keys[row, a, 2:] = arm
-    summed, scatter, cost, lane = ints[LIKELIHOOD] == EXACT, rows[0, turn, a], rows[1, row, a], rows[2, row, a]
-    fill_row(coef, 0, entries, 1.0, z[1], z[2], arm, summed, scatter, cost, lane)
-    fill_row(coef, entries, halves, -1.0, z[1], z[2], arm, summed, scatter, cost, lane)
+    for j in range(ARM):
+        keys[row, a, 2 + j] = arm[j]
+    fill_side(coef, 0, entries, 1.0, z, arm, stray, scatter[turn, a], rows[row, a])
+    fill_side(coef, entries, coef.shape[1], -1.0, z, arm, stray, scatter[turn, a], rows[row, a])
 
 
 def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
@@ -167,33 +169,36 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     if out[0] == -math.inf:
         return
     kind, halves, entries, num = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
-    which, keys, turns, rows, counts, room = memory(cache, halves)
+    which, keys, turns, scatter, rows, counts, room = memory(cache, halves)
     if kind == POINT:
         out[1] = point_score(z, floats, ints, counts)
         return
-    cell = cell_of(z[1], z[2]) if kind == HALF else 0
+    cell, stray = 0, floats[:0]
     if kind == HALF:
+        cell = cell_of(z[1], z[2])
         coef = coefficients_at(cell, floats, ints, room)
     else:
         coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
+        stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
     for a in range(num):
-        update_arm(a, z, coef, float(cell), ints, which, keys, turns, rows)
+        update_arm(a, z, coef, stray, float(cell), entries, which, keys, turns, scatter, rows)
     pick, in_lanes, out_lanes = which[1], lanes_of(z, ENTRIES), lanes_of(z, EXITS)
     if kind == HALF:
-        out[1] = density.closest_arms(rows[1], rows[2], pick, num, 0, entries, in_lanes, counts)
-        out[1] += density.closest_arms(rows[1], rows[2], pick, num, entries, halves, out_lanes, counts)
+        out[1] = density.closest_arms(rows, pick, num, 0, entries, in_lanes, counts)
+        out[1] += density.closest_arms(rows, pick, num, entries, halves, out_lanes, counts)
         return
-    stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
-    log_clutter, log_kept = floats[LOG_CLUTTER], floats[LOG_KEPT]
+    low, second = room[:halves], room[halves : 2 * halves]
+    density.two_lowest(rows, pick, num, low, second)
+    share = (floats[LOG_CLUTTER], floats[LOG_KEPT])
     out[1] = floats[CONSTANT]
-    out[1] += density.sum_arms(rows[1], pick, num, 0, entries, in_lanes, stray, log_clutter, log_kept)
-    out[1] += density.sum_arms(rows[1], pick, num, entries, halves, out_lanes, stray, log_clutter, log_kept)
+    out[1] += density.sum_arms(rows, pick, num, 0, entries, in_lanes, low, second, stray, *share)
+    out[1] += density.sum_arms(rows, pick, num, entries, halves, out_lanes, low, second, stray, *share)
 
 
 def refit(z, floats, ints, cache):  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of the continuous numbers, in place; the cache holds z evaluated last."""
     kind, halves, entries = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES]
-    which, _, _, rows, _, room = memory(cache, halves)
+    which, _, _, _, rows, _, room = memory(cache, halves)
     if kind == HALF:
         coef = coefficients_at(cell_of(z[1], z[2]), floats, ints, room)
         stray = np.full(halves, density.NO_LANE)
@@ -202,7 +207,7 @@ def refit(z, floats, ints, cache):  # type: ignore[no-untyped-def]
         stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
     size = 2 + FREE * int(z[0])
     hessian, gradient = np.empty((size, size)), np.empty(size)
-    quadratic_model(z, coef, entries, stray, rows[1], rows[2], which[1], floats, hessian, gradient)
+    quadratic_model(z, coef, entries, stray, rows, which[1], floats, hessian, gradient)
     if solve_spd(hessian, gradient, size):
         take_step(z, gradient, floats[GAP_MAX])
 
@@ -224,10 +229,10 @@ def compiled() -> dict[str, Any]:
 
 def settings(model: Junction) -> Array:
     """Numbers of the prior and the moves."""
-    low = 0.0 if model.one_way else 1.0
-    spreads = (math.log(model.width), model.width_spread, model.bend_std, model.shift_std)
-    small = float(model.steps == "extended")
-    return np.array([model.centre_std, model.gap_max, *spreads, low, model.max_lanes, small])
+    spreads = (model.width_spread, model.bend_std, model.shift_std)
+    low = 0 if model.one_way else 1
+    numbers = prior_numbers(model.centre_std, model.gap_max, model.width, spreads, low, model.max_lanes)
+    return np.array([*numbers, float(model.steps == "extended")])
 
 
 def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -237,6 +242,7 @@ def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> 
     heading = model.heading_std
     if kind == EXACT:
         front, stray = clutter_costs(evidence, model)
+        stray = stray if model.clutter > 0 else np.full_like(stray, 0.1 * density.NO_LANE)
         head = [*settings(model), *log_share, model.position_std, heading, front.sum()]
         floats = np.concatenate([head, scaled(evidence, observed, model).ravel(), stray])
         return floats, np.array([kind, evidence.num_halves, evidence.entries, 0, 0], dtype=np.int64)

@@ -9,25 +9,29 @@ import numba as nb
 from models.intersection.angles import MIN_SEPARATION
 from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, MAX_ARMS, MIN_ARMS, SHIFT, WIDTH
 
-# rows of the prior's numbers, at the head of the kernel's floats
+# the prior's numbers, at the head of the kernel's floats: settings, then logarithms made once from them
 CENTRE_STD, GAP_MAX, LOG_WIDTH, WIDTH_SPREAD, BEND_STD, SHIFT_STD, MIN_LANES, MAX_LANES = range(8)
-NUM_PRIOR = 8
+LOG_HEAD, LOG_SLOT, LOG_SOME, LOG_ANY = range(8, 12)
+NUM_PRIOR = 12
 LOG_2PI = math.log(2 * math.pi)
 
 
-@nb.njit(cache=True)
-def log_normal(x, std):  # type: ignore[no-untyped-def]
-    """log N(x; 0, std^2); zero where std = 0: the value is a constant."""
-    if std == 0.0:
-        return 0.0
-    return -0.5 * (x / std) ** 2 - math.log(std) - 0.5 * LOG_2PI
+def prior_numbers(
+    centre_std: float, gap_max: float, width: float, spreads: tuple[float, float, float], min_lanes: int, max_lanes: int
+) -> list[float]:
+    """Settings of the prior and the logarithms of its normalisers; spreads of log width, bend, shift, 0 fixes one."""
+    log_head = -2.0 * math.log(centre_std) - LOG_2PI - math.log(MAX_ARMS - MIN_ARMS + 1.0) - MAX_ARMS * LOG_2PI
+    log_slot = -math.log(gap_max) - math.log(max_lanes - min_lanes + 1.0)
+    log_slot -= sum(math.log(std) + 0.5 * LOG_2PI for std in spreads if std > 0)
+    log_some, log_any = -math.log(max_lanes), -math.log(max_lanes - min_lanes + 1.0)
+    settings = [centre_std, gap_max, math.log(width), *spreads, float(min_lanes), float(max_lanes)]
+    return [*settings, log_head, log_slot, log_some, log_any]
 
 
 @nb.njit(cache=True)
-def log_exits(entries, numbers):  # type: ignore[no-untyped-def]
-    """log p(exits | entries): uniform, and not zero where entries are."""
-    low = 1.0 if entries < 0.5 else numbers[MIN_LANES]
-    return -math.log(numbers[MAX_LANES] - low + 1.0)
+def square(x, std):  # type: ignore[no-untyped-def]
+    """(x / std)^2 / 2; zero where std = 0: the value is a constant."""
+    return 0.5 * (x / std) ** 2 if std > 0.0 else 0.0
 
 
 @nb.njit(cache=True)
@@ -43,12 +47,11 @@ def log_slot(z, a, numbers):  # type: ignore[no-untyped-def]
     o = HEAD + a * ARM
     if not 0.0 <= z[o + GAP] <= numbers[GAP_MAX] or not lanes_fit(z[o + ENTRIES], z[o + EXITS], numbers):
         return -math.inf
-    value = -math.log(numbers[GAP_MAX]) - math.log(numbers[MAX_LANES] - numbers[MIN_LANES] + 1.0)
-    value += log_exits(z[o + ENTRIES], numbers)
+    value = numbers[LOG_SLOT] + (numbers[LOG_SOME] if z[o + ENTRIES] < 0.5 else numbers[LOG_ANY])
     if numbers[WIDTH_SPREAD] > 0.0:
         log_width = math.log(z[o + WIDTH])
-        value += log_normal(log_width - numbers[LOG_WIDTH], numbers[WIDTH_SPREAD]) - log_width
-    return value + log_normal(z[o + BEND], numbers[BEND_STD]) + log_normal(z[o + SHIFT], numbers[SHIFT_STD])
+        value -= square(log_width - numbers[LOG_WIDTH], numbers[WIDTH_SPREAD]) + log_width
+    return value - square(z[o + BEND], numbers[BEND_STD]) - square(z[o + SHIFT], numbers[SHIFT_STD])
 
 
 @nb.njit(cache=True)
@@ -72,9 +75,8 @@ def log_prior(z, numbers):  # type: ignore[no-untyped-def]
     for a in range(num):
         if not apart(z, num, z[HEAD + a * ARM + ANGLE], a):
             return -math.inf
-    value = -math.log(MAX_ARMS - MIN_ARMS + 1.0) - MAX_ARMS * LOG_2PI
-    value -= (num - 1.0) * math.log1p(-num * MIN_SEPARATION / (2.0 * math.pi))
-    value += log_normal(z[1], numbers[CENTRE_STD]) + log_normal(z[2], numbers[CENTRE_STD])
+    value = numbers[LOG_HEAD] - (num - 1.0) * math.log1p(-num * MIN_SEPARATION / (2.0 * math.pi))
+    value -= square(z[1], numbers[CENTRE_STD]) + square(z[2], numbers[CENTRE_STD])
     for a in range(MAX_ARMS):
         value += log_slot(z, a, numbers)
     return value

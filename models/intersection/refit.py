@@ -168,7 +168,7 @@ def solve_spd(matrix, vector, n):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def quadratic_model(z, coef, entries, stray, rows, lanes, pick, floats, hessian, gradient):  # type: ignore[no-untyped-def]
+def quadratic_model(z, coef, entries, stray, rows, pick, floats, hessian, gradient):  # type: ignore[no-untyped-def]
     """Hessian and gradient of -log p at z, halves on their closest lanes; stray halves say nothing."""
     num = int(z[0])
     where, slopes = np.zeros(7, np.int64), np.zeros(7)
@@ -177,11 +177,11 @@ def quadratic_model(z, coef, entries, stray, rows, lanes, pick, floats, hessian,
     for h in range(coef.shape[1]):
         low, arm = NO_LANE, 0
         for a in range(num):
-            if rows[int(pick[a]), a, h] < low:
-                low, arm = rows[int(pick[a]), a, h], a
+            if rows[int(pick[a]), a, 0, h] < low:
+                low, arm = rows[int(pick[a]), a, 0, h], a
         if low < NO_LANE and low < stray[h]:
             side = 1.0 if h < entries else -1.0
-            add_half(coef, h, side, lanes[int(pick[arm]), arm, h], z, arm, hessian, gradient, where, slopes)
+            add_half(coef, h, side, rows[int(pick[arm]), arm, 1, h], z, arm, hessian, gradient, where, slopes)
     add_prior(z, floats, hessian, gradient)
 
 

@@ -57,12 +57,12 @@ class Junction:
     shift_std: float = 0.3  # of an arm beside the centre [m]; 0: all meet in it
     position_std: float = 1.0  # of a point across its lane [m]
     along_std: float = 3.0  # of a point along its lane [m]
-    offset_std: float = 0.4  # of a whole half track across its lane [m]
+    offset_std: float = 0.3  # of a whole half track across its lane [m]
     phase_std: float = 20.0  # of a whole half track along its lane [m]
     heading_std: float = 0.3  # of a measured heading about the arm [rad]
     clutter: float = 0.02  # share of half tracks on no lane
     clutter_radius: float = 60.0  # where their points are uniform [m]
-    inner_radius: float = 20.0  # points closer to the crossing are on no arm [m]
+    inner_radius: float = 35.0  # points closer to the crossing are on no arm [m]
 
     def __post_init__(self) -> None:
         if self.likelihood != "exact" and self.bend_std > 0:

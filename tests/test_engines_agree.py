@@ -1,0 +1,71 @@
+"""Every engine on the conjugate Gaussian, whose posterior is known in closed form.
+
+A new engine joins ENGINES. Tolerances come from the draws themselves: the standard error of a mean
+from ArviZ, and that of a standard deviation from the mean of squared deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from inference import diagnostics, least_squares, rjmcmc
+from inference.posterior import Posterior
+from models.program import simulate
+from models.toys.gaussian import ConjugateGaussian, Readings
+
+MODEL = ConjugateGaussian(step=0.8)
+BLANK = Readings(torch.linspace(-1.0, 1.0, 20, dtype=torch.float64), None)
+EVIDENCE = BLANK._replace(y=simulate(MODEL, BLANK, num=1, seed=3)["y"][0])
+
+ENGINES: dict[str, Callable[[], Posterior]] = {
+    "least_squares": lambda: least_squares.run(MODEL, EVIDENCE, seed=1, num_draws=4000),
+    "rjmcmc": lambda: rjmcmc.run(MODEL, EVIDENCE, seed=1, num_chains=20, num_steps=1500, warmup=300),
+}
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def posterior(request: pytest.FixtureRequest) -> Posterior:
+    return ENGINES[request.param]()
+
+
+@pytest.mark.parametrize("element", [0, 1])
+def test_mean_and_sd_are_exact_within_four_standard_errors(posterior: Posterior, element: int) -> None:
+    mean, covariance, _ = MODEL.exact(EVIDENCE)
+    sd = float(covariance[element, element].sqrt())
+    draws = posterior.draws["beta"][..., element]
+    error = diagnostics.standard_error(draws)
+    assert error < 0.1 * sd, "too few effective draws to test anything"
+    assert abs(draws.mean() - float(mean[element])) < 4 * error
+    squares = np.square(draws - float(mean[element]))
+    assert abs(squares.mean() - sd**2) < 4 * diagnostics.standard_error(squares)
+
+
+def test_correlation_is_exact_within_four_standard_errors(posterior: Posterior) -> None:
+    mean, covariance, _ = MODEL.exact(EVIDENCE)
+    gaps = posterior.draws["beta"] - mean.numpy()
+    products = gaps[..., 0] * gaps[..., 1]
+    assert abs(products.mean() - float(covariance[0, 1])) < 4 * diagnostics.standard_error(products)
+
+
+def test_best_state_is_near_the_mode(posterior: Posterior) -> None:
+    """The best of many draws lies within half a standard deviation of the mode."""
+    mean, covariance, _ = MODEL.exact(EVIDENCE)
+    gap = np.abs(posterior.estimate["beta"] - mean.numpy()) / covariance.diagonal().sqrt().numpy()
+    assert gap.max() < 0.5
+
+
+def test_posterior_tells_what_it_cost(posterior: Posterior) -> None:
+    assert posterior.info["evaluations"] > 0
+    assert posterior.info["seconds"] > 0
+    assert posterior.snapshots is not None
+    assert np.all(np.diff(posterior.snapshots.seconds) >= 0)
+    assert np.all(np.diff(posterior.snapshots.log_joint) > -1e-9)
+
+
+def test_estimates_of_the_evidence_are_exact() -> None:
+    _, _, log_evidence = MODEL.exact(EVIDENCE)
+    assert ENGINES["least_squares"]().log_evidence == pytest.approx(float(log_evidence), abs=1e-8)

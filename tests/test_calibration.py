@@ -20,6 +20,7 @@ FUNCTIONALS: dict[str, calibration.Functional] = {
     "level": lambda z: z["beta"][:, 0],
     "slope": lambda z: z["beta"][:, 1],
 }
+CONSTANT: dict[str, calibration.Functional] = {"one": lambda z: 0 * z["beta"][:, 0]}
 
 
 def exact_draws(evidence: Readings, num: int, seed: int, spread: float = 1.0) -> np.ndarray:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
 
 from models.intersection.moments import (
     A0,
@@ -43,6 +44,7 @@ LIKELIHOODS = {"exact": EXACT, "half": HALF, "point": POINT}
 NEGLIGIBLE = 37.0  # exp(-37) is below the resolution of a double next to 1
 FAR_LANE = 18.0  # a lane with less than exp(-18) of the closest one's weight is left out of the sum
 NO_LANE = 1e18  # cost where an arm has no lane of the driving direction
+LOG_FACTORIAL = np.array([math.lgamma(n + 1.0) for n in range(256)])
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
@@ -172,10 +174,12 @@ def closest_arms(rows, pick, num_arms, first, last, num_lanes, counts):  # type:
 def multinomial(counts, num_lanes):  # type: ignore[no-untyped-def]
     """log T! - sum log n! - T log L of the track counts per lane."""
     tracks, total = 0.0, 0.0
-    for count in counts.flat:
-        tracks += count
-        if count > 1.0:
-            total -= math.lgamma(count + 1.0)
+    for a in range(counts.shape[0]):
+        for lane in range(counts.shape[1]):
+            count = counts[a, lane]
+            tracks += count
+            if count > 1.0:
+                total -= LOG_FACTORIAL[int(count)] if count < 256.0 else math.lgamma(count + 1.0)
     return total + math.lgamma(tracks + 1.0) - tracks * math.log(num_lanes)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from models.capability import Kernel, Move, Proposal, kernel_types
 from models.intersection import density, moves
+from models.intersection.borrow import borrow
 from models.intersection.density import EXACT, HALF, LIKELIHOODS, POINT
 from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
 from models.intersection.halves import smooth
@@ -62,8 +63,8 @@ def memory_size(ints):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def memory(cache, halves):  # type: ignore[no-untyped-def]
-    """Named views of the cache: which row of each slot is current and which is evaluated, for rows and for
-    their scatter; the numbers each was computed from; scatter (2, A, H); cost, lane, residual (2, A, 3, H); counts; the rest."""
+    """Named views of the cache: which row of each slot is current and which is evaluated, for rows and for their
+    scatter; the numbers each was computed from; scatter (2, A, H); cost, lane, residual (2, A, 3, H); counts; room."""
     n = MAX_ARMS
     which = cache[: 4 * n].reshape((4, n))
     o = 4 * n
@@ -140,27 +141,26 @@ def fill_side(coef, first, last, side, z, arm, stray, scatter, row):  # type: ig
 
 
 @nb.njit(cache=True)
-def update_arm(a, z, coef, stray, cell, entries, which, keys, turns, scatter, rows):  # type: ignore[no-untyped-def]
-    """Make sure that a slot's row for z is at hand, computing only what changed."""
-    arm = z[HEAD + a * ARM : HEAD + (a + 1) * ARM]
-    row = int(which[0, a])
-    known = keys[row, a, 0] == z[1] and keys[row, a, 1] == z[2]
-    for j in range(ARM):
-        known = known and keys[row, a, 2 + j] == arm[j]
-    which[1, a], which[3, a] = row, which[2, a]
-    if known:
-        return
-    row, turn = 1 - row, int(which[2, a])
-    if not (turns[turn, a, 0] == arm[0] and turns[turn, a, 1] == arm[5] and turns[turn, a, 2] == cell):
-        turn = 1 - turn
-        turns[turn, a, 0], turns[turn, a, 1], turns[turn, a, 2] = arm[0], arm[5], cell
-        density.scatter_row(coef, arm[0], arm[5], scatter[turn, a])
-    which[1, a], which[3, a] = row, turn
-    keys[row, a, 0], keys[row, a, 1] = z[1], z[2]
-    for j in range(ARM):
-        keys[row, a, 2 + j] = arm[j]
-    fill_side(coef, 0, entries, 1.0, z, arm, stray, scatter[turn, a], rows[row, a])
-    fill_side(coef, entries, coef.shape[1], -1.0, z, arm, stray, scatter[turn, a], rows[row, a])
+def update_arms(z, coef, stray, cell, entries, which, keys, turns, scatter, rows):  # type: ignore[no-untyped-def]
+    """Make sure that the rows of all active slots for z are at hand, computing only what changed."""
+    for a in range(int(z[0])):
+        arm = z[HEAD + a * ARM : HEAD + (a + 1) * ARM]
+        row, turn = int(which[0, a]), int(which[2, a])
+        known = keys[row, a, 0] == z[1] and keys[row, a, 1] == z[2]
+        for j in range(ARM):
+            known = known and keys[row, a, 2 + j] == arm[j]
+        if not known:
+            row = 1 - row
+            keys[row, a, 0], keys[row, a, 1] = z[1], z[2]
+            for j in range(ARM):
+                keys[row, a, 2 + j] = arm[j]
+            if not (turns[turn, a, 0] == arm[0] and turns[turn, a, 1] == arm[5] and turns[turn, a, 2] == cell):
+                turn = 1 - turn
+                turns[turn, a, 0], turns[turn, a, 1], turns[turn, a, 2] = arm[0], arm[5], cell
+                density.scatter_row(coef, arm[0], arm[5], scatter[turn, a])
+            fill_side(coef, 0, entries, 1.0, z, arm, stray, scatter[turn, a], rows[row, a])
+            fill_side(coef, entries, coef.shape[1], -1.0, z, arm, stray, scatter[turn, a], rows[row, a])
+        which[1, a], which[3, a] = row, turn
 
 
 def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
@@ -168,6 +168,7 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     out[0], out[1] = log_prior(z, floats), -math.inf
     if out[0] == -math.inf:
         return
+    z, floats, cache = borrow(z), borrow(floats), borrow(cache)
     kind, halves, entries, num = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
     which, keys, turns, scatter, rows, counts, room = memory(cache, halves)
     if kind == POINT:
@@ -180,8 +181,7 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     else:
         coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
         stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
-    for a in range(num):
-        update_arm(a, z, coef, stray, float(cell), entries, which, keys, turns, scatter, rows)
+    update_arms(z, coef, stray, float(cell), entries, which, keys, turns, scatter, rows)
     pick, in_lanes, out_lanes = which[1], lanes_of(z, ENTRIES), lanes_of(z, EXITS)
     if kind == HALF:
         out[1] = density.closest_arms(rows, pick, num, 0, entries, in_lanes, counts)

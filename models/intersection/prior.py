@@ -28,7 +28,7 @@ def prior_numbers(
     return [*settings, log_head, log_slot, log_some, log_any]
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, fastmath={"arcp", "contract"}, error_model="numpy")
 def square(x, std):  # type: ignore[no-untyped-def]
     """(x / std)^2 / 2; zero where std = 0: the value is a constant."""
     return 0.5 * (x / std) ** 2 if std > 0.0 else 0.0
@@ -41,7 +41,7 @@ def lanes_fit(entries, exits, numbers):  # type: ignore[no-untyped-def]
     return low <= entries <= high and low <= exits <= high and entries + exits >= 1.0
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, fastmath={"arcp", "contract"}, error_model="numpy")
 def log_slot(z, a, numbers):  # type: ignore[no-untyped-def]
     """log density of a slot but for its angle."""
     o = HEAD + a * ARM
@@ -72,8 +72,8 @@ def log_prior(z, numbers):  # type: ignore[no-untyped-def]
     num = int(z[0])
     if not MIN_ARMS <= num <= MAX_ARMS:
         return -math.inf
-    for a in range(num):
-        if not apart(z, num, z[HEAD + a * ARM + ANGLE], a):
+    for a in range(1, num):
+        if not apart(z, a, z[HEAD + a * ARM + ANGLE], a):
             return -math.inf
     value = numbers[LOG_HEAD] - (num - 1.0) * math.log1p(-num * MIN_SEPARATION / (2.0 * math.pi))
     value -= square(z[1], numbers[CENTRE_STD]) + square(z[2], numbers[CENTRE_STD])

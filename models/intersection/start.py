@@ -63,7 +63,7 @@ def group_directions(directions, angles):  # type: ignore[no-untyped-def]
 def lane_range(offsets, width, most):  # type: ignore[no-untyped-def]
     """Inner edge and number of lanes that hold sorted lateral offsets."""
     low, high = offsets[len(offsets) // 10], offsets[-1 - len(offsets) // 10]
-    count = min(max(int(round((high - low) / width)) + 1, 1), most)
+    count = min(max(int((high - low) / width + 0.5) + 1, 1), most)
     return 0.5 * (low + high) - 0.5 * count * width, float(count)
 
 

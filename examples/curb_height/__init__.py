@@ -1,0 +1,1 @@
+"""An example outside the tree: is the kerb lowered, and where?"""

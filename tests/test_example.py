@@ -1,0 +1,56 @@
+"""The package under examples/ runs through `waybayes` without a change to the tree."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from models.program import check, simulate
+from tests.involution import assert_involution, uniforms
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def launch(folder: Path, runs: Path, *arguments: str, path: str = "") -> dict[str, float]:
+    """Scores of a run started in `folder`."""
+    command = [sys.executable, "-m", "experiments.run", *arguments, "experiment=driveway", f"runs={runs}"]
+    places = os.pathsep.join(filter(None, [str(EXAMPLES.parent), path]))
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | {"PYTHONPATH": places}, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    (result,) = runs.glob("driveway-curb_height-rjmcmc-*")
+    assert (result / "report.html").is_file()
+    return json.loads((result / "scores.json").read_text())
+
+
+def test_example_finds_the_driveway_from_its_own_folder(tmp_path: Path) -> None:
+    scores = launch(EXAMPLES, tmp_path / "runs", "hydra.searchpath=[pkg://curb_height.configs]")
+    assert scores["true_model_probability"] > 0.9
+    assert scores["begin_error_sd"] < 4.0
+
+
+def test_example_runs_from_anywhere_by_file_and_python_path(tmp_path: Path) -> None:
+    search = f"hydra.searchpath=[file://{EXAMPLES / 'curb_height' / 'configs'}]"
+    short = ("engine.num_steps=20", "engine.warmup=10")
+    scores = launch(tmp_path, tmp_path / "runs", search, *short, path=str(EXAMPLES))
+    assert "true_model_probability" in scores
+
+
+def test_example_keeps_to_the_seam_in_forty_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    from curb_height.model import CurbHeight
+    from curb_height.scenario import driveway
+
+    model, data = CurbHeight(), driveway().data
+    check(model, data)
+    latents = simulate(model, data, num=100, seed=0)
+    for move in model.moves():
+        assert_involution(move, latents, uniforms(move, 100, seed=1))
+    lines = (EXAMPLES / "curb_height" / "model.py").read_text().partition("@dataclass")[2].splitlines()
+    assert sum(bool(line.strip()) for line in lines) <= 40

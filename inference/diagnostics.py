@@ -25,9 +25,11 @@ MODEL_INDEX = "model_index"
 
 
 def scalars(posterior: Posterior) -> dict[str, Array]:
-    """Scalars whose meaning is the same in every draw, {"site" or "site[i]": (chain, draw)}."""
+    """Scalars whose meaning is the same in every draw, {"site" or "site[i]": (chain, draw)}.
+
+    The model index stands under its own name only where it is not one of the sites."""
     columns: dict[str, Array] = {}
-    if posterior.model_index is not None:
+    if posterior.model_index is not None and not _is_site(posterior.model_index, posterior):
         columns[MODEL_INDEX] = posterior.model_index.astype(np.float64)
     for site, values in posterior.draws.items():
         if values.ndim == 2:
@@ -36,6 +38,10 @@ def scalars(posterior: Posterior) -> dict[str, Array]:
             for index in np.ndindex(values.shape[2:]):
                 columns[f"{site}{list(index)}"] = values[(..., *index)].astype(np.float64)
     return columns
+
+
+def _is_site(index: Array, posterior: Posterior) -> bool:
+    return any(values.ndim == 2 and np.array_equal(values, index) for values in posterior.draws.values())
 
 
 def summary(posterior: Posterior) -> dict[str, dict[str, float]]:

@@ -241,4 +241,4 @@ def test_draws_are_laid_out_as_the_posterior_says() -> None:
     assert posterior.draws["d0"].dtype == np.float64
     np.testing.assert_array_equal(posterior.model_index, posterior.draws["num_knots"])
     assert set(posterior.info["acceptance"]) <= {move.name for move in model.moves()}
-    assert set(diagnostics.summary(posterior)) == {"model_index", "num_knots", "d0", "psi0", "kappa0"}
+    assert set(diagnostics.summary(posterior)) == {"num_knots", "d0", "psi0", "kappa0"}

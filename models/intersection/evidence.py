@@ -31,7 +31,6 @@ class JunctionEvidence(NamedTuple):
     entries  number of entry halves
     origin   (2,) where the tracks meet [m]
     heading  whether headings were measured
-    moments  (12, H) of the points; None where they are simulated
     whole    the tracks as given, about the origin: [M20]'s likelihoods split them at the latent centre
     """
 
@@ -41,12 +40,18 @@ class JunctionEvidence(NamedTuple):
     entries: int
     origin: Array
     heading: bool
-    moments: Array | None
     whole: Tracks | None
 
     @property
     def num_halves(self) -> int:
         return len(self.starts) - 1
+
+    @property
+    def moments(self) -> Array:
+        """(12, H) of the points."""
+        assert self.points is not None
+        x, y, phi = np.ascontiguousarray(self.points.numpy())
+        return np.asarray(moments(x, y, phi, self.s, self.starts))
 
 
 def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
@@ -69,8 +74,7 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
         )
     observed, s, starts = hv.gather_halves(points, path, phi, begin, end, entries, origin)
     whole = Tracks(points - origin, phi, offsets) if model.likelihood != "exact" else None
-    known = moments(observed[0], observed[1], observed[2], s, starts)
-    return JunctionEvidence(torch.from_numpy(observed), s, starts, int(entries), origin, measured, known, whole)
+    return JunctionEvidence(torch.from_numpy(observed), s, starts, int(entries), origin, measured, whole)
 
 
 def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Array:

@@ -258,7 +258,6 @@ def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> 
 
 def junction_kernel(model: Junction, evidence: JunctionEvidence) -> Kernel:
     """The compiled kernel of a model and its evidence."""
-    assert evidence.moments is not None
     floats, ints = bound_data(model, evidence, evidence.moments)
     table = move_table(model)
     constants = model.constants

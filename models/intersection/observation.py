@@ -15,7 +15,7 @@ from torch.distributions import constraints
 
 from models.intersection.evidence import JunctionEvidence
 from models.intersection.kernel import bound_data, compiled, memory_size
-from models.intersection.moments import CHORD, moments
+from models.intersection.moments import CHORD
 from models.intersection.packing import MAX_ARMS, pack
 
 if TYPE_CHECKING:
@@ -71,18 +71,11 @@ class TracksOnLanes(TorchDistribution):
         out, points = np.empty((len(z), 2)), value.reshape(-1, 3, value.shape[-1])
         for b, observed in enumerate(points):
             rows = z if len(points) == 1 else z[b : b + 1]
-            floats, ints = bound_data(self.model, self.evidence, self._moments(observed))
+            floats, ints = bound_data(self.model, self.evidence, self.evidence._replace(points=observed).moments)
             cache = np.full(int(memory_size(ints)), 0.0)
             _likelihood_rows()(rows, floats, ints, cache, out if len(points) == 1 else out[b : b + 1])
         shape = torch.broadcast_shapes(self.batch_shape, value.shape[:-2])
         return torch.from_numpy(out[:, 1].copy()).reshape(shape)
-
-    def _moments(self, observed: Tensor) -> np.ndarray:
-        if self.evidence.points is not None and observed.data_ptr() == self.evidence.points.data_ptr():
-            assert self.evidence.moments is not None
-            return self.evidence.moments
-        x, y, phi = np.ascontiguousarray(observed.numpy())
-        return np.asarray(moments(x, y, phi, self.evidence.s, self.evidence.starts))
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         if self.model.likelihood != "exact":

@@ -95,7 +95,6 @@ def fill_arms(z, num, mean, directions, entries, width, max_lanes, gap_max, one_
 
 def start_from_halves(model: Junction, evidence: JunctionEvidence) -> dict[str, Any]:
     """{site: (*event)}; raises InputError where the halves point in fewer than two directions."""
-    assert evidence.moments is not None
     observed = evidence.moments
     directions = np.arctan2(observed[CYS], observed[CXS])  # slope of the points over s
     angles = np.zeros(MAX_ARMS)

@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from models.capability import Kernel, kernel_types
 
-REFITS = 3  # Gauss-Newton steps after an edit
+REFITS = 12  # Gauss-Newton steps after an edit, at most
+PATIENCE = 3  # refits after which an edit must be close to the best
 SWEEPS = 6  # at most
 HOPELESS = 400.0  # nats below the best after the first refit: give the edit up
+CLOSE = 25.0  # nats
+SETTLED = 0.02  # nats gained by a refit
 WORTH = 0.5  # nats that make another sweep worthwhile
 
 
@@ -36,9 +39,12 @@ def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, sco
             for step in range(REFITS + 1):
                 evaluate(trial, floats, ints, cache, out)
                 value = out[0] + out[1]
-                if value > top:
+                gain = value - top
+                if gain > 0.0:
                     top, best[:] = value, trial
-                if step == REFITS or not np.isfinite(value) or (step > 0 and top < score[0] - HOPELESS):
+                if not np.isfinite(value) or (step > 0 and top < score[0] - HOPELESS):
+                    break
+                if step >= PATIENCE and (top < score[0] - CLOSE or gain < SETTLED):
                     break
                 refit(trial, floats, ints, cache)
             if top > score[0] + 1e-6:

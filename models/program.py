@@ -115,7 +115,8 @@ def _is_evidence(site: Site) -> bool:
 def _site_log_prob(name: str, site: Site) -> Tensor:
     """Log density of one site, -inf outside its support, (*batch, *plates)."""
     fn, value = site["fn"], site["value"]
-    log_prob = fn.log_prob(value)
+    with pyro.validation_enabled(False):
+        log_prob = fn.log_prob(value)
     inside = fn.support.check(value)
     if not bool(inside.all()):
         log_prob = torch.where(inside, log_prob, -torch.inf)
@@ -207,7 +208,16 @@ def fix(model: Model, **values: Tensor | float) -> Fixed:
 def check(model: Model, evidence: Any) -> None:
     """Run the program twice over prior draws and raise InputError for what engines would trip on:
     a site whose density does not keep the batch, an observation outside its support."""
-    draws = simulate(model, evidence, num=2, seed=0)
+    try:
+        draws = simulate(model, evidence, num=2, seed=0)
+    except (RuntimeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"the program does not run for a batch of 2 draws ({reason}); declare each site's own dimensions "
+            "with .to_event()"
+        ) from error
     sites = _sites(model, evidence, _Given(draws))
     plates = _plate_dims(sites)
     for name, site in sites.items():

@@ -36,25 +36,30 @@ FREE = 5  # continuous numbers of an arm
 FREE_FIELDS = np.array([ANGLE, GAP, WIDTH, BEND, SHIFT])
 FARTHEST = np.array([0.1, 1.5, 0.5, 0.005, 1.0])  # largest step of each
 SYSTEM = 2 + FREE * MAX_ARMS
-EDITS_PER_ARM = 11
 
-# (entries, exits, gap in widths, axis in widths) of the edits of an arm
+# (entries, exits, gap in widths, axis in widths, keep the span) of the edits of an arm: outer lanes, inner lanes,
+# lanes that change sides, and lanes that share the width that the side had before
 EDITS = np.array(
     [
-        (1, 0, 0, 0),
-        (-1, 0, 0, 0),
-        (0, 1, 0, 0),
-        (0, -1, 0, 0),
-        (1, 0, -1, -0.5),
-        (-1, 0, 1, 0.5),
-        (0, 1, -1, 0.5),
-        (0, -1, 1, -0.5),
-        (1, -1, 0, -1),
-        (-1, 1, 0, 1),
-        (-1, -1, 2, 0),
+        (1, 0, 0, 0, 0),
+        (-1, 0, 0, 0, 0),
+        (0, 1, 0, 0, 0),
+        (0, -1, 0, 0, 0),
+        (1, 0, -1, -0.5, 0),
+        (-1, 0, 1, 0.5, 0),
+        (0, 1, -1, 0.5, 0),
+        (0, -1, 1, -0.5, 0),
+        (1, -1, 0, -1, 0),
+        (-1, 1, 0, 1, 0),
+        (-1, -1, 2, 0, 0),
+        (1, 0, 0, 0, 1),
+        (-1, 0, 0, 0, 1),
+        (0, 1, 0, 0, 1),
+        (0, -1, 0, 0, 1),
     ],
     dtype=np.float64,
 )
+EDITS_PER_ARM = len(EDITS)
 
 
 def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
@@ -69,6 +74,11 @@ def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
     z_new[o + EXITS] += change[1]
     z_new[o + GAP] = min(max(z[o + GAP] + change[2] * z[o + WIDTH], 0.0), floats[GAP_MAX])
     axis = change[3] * z[o + WIDTH]
+    if change[4] > 0.0:
+        side = o + ENTRIES if change[0] != 0.0 else o + EXITS
+        if floats[WIDTH_SPREAD] == 0.0 or z[side] * z_new[side] < 0.5:
+            return False
+        z_new[o + WIDTH] *= z[side] / z_new[side]
     if floats[SHIFT_STD] > 0.0:
         z_new[o + SHIFT] += axis
     else:

@@ -142,7 +142,9 @@ def fill_side(coef, first, last, side, z, arm, stray, scatter, row):  # type: ig
 
 @nb.njit(cache=True)
 def update_arms(z, coef, stray, cell, entries, which, keys, turns, scatter, rows):  # type: ignore[no-untyped-def]
-    """Make sure that the rows of all active slots for z are at hand, computing only what changed."""
+    """Make sure that the rows of all active slots for z are at hand, computing only what changed.
+
+    cell counts from 1: the cache begins as zeros, and an arm at angle 0 must not be taken for known."""
     for a in range(int(z[0])):
         arm = z[HEAD + a * ARM : HEAD + (a + 1) * ARM]
         row, turn = int(which[0, a]), int(which[2, a])
@@ -181,7 +183,7 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     else:
         coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
         stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
-    update_arms(z, coef, stray, float(cell), entries, which, keys, turns, scatter, rows)
+    update_arms(z, coef, stray, cell + 1.0, entries, which, keys, turns, scatter, rows)
     pick, in_lanes, out_lanes = which[1], lanes_of(z, ENTRIES), lanes_of(z, EXITS)
     if kind == HALF:
         out[1] = density.closest_arms(rows, pick, num, 0, entries, in_lanes, counts)

@@ -65,8 +65,9 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
     path = hv.smooth(points, offsets)
     origin = hv.crossing(path, offsets)
     measured = tracks.heading is not None
-    phi = hv.unwrap(np.asarray(tracks.heading), offsets) if measured else hv.path_headings(path, offsets)
-    begin, end, entries = hv.outer_halves(path, offsets, origin, model.inner_radius, MIN_POINTS)
+    turn = hv.path_headings(path, offsets)
+    phi = hv.unwrap(np.asarray(tracks.heading), offsets) if measured else turn
+    begin, end, entries = hv.outer_halves(path, turn, offsets, origin, model.inner_radius, MIN_POINTS)
     if len(begin) == 0:
         raise InputError(
             f"none of the {len(offsets) - 1} tracks has {MIN_POINTS} points outside {model.inner_radius:g} m and "

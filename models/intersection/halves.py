@@ -9,6 +9,10 @@ import numpy as np
 
 SMOOTHING = 4  # points on either side
 END = 24  # points at a track's end that show an arm's direction
+TURN = 0.25  # change of direction that ends an arm [rad]
+MARGIN = 4  # points left out before a turn
+ENOUGH = 30.0  # [m] of a half track
+LEAST_RADIUS = 12.0  # [m] inside which no point is on an arm
 
 
 @nb.njit(cache=True)
@@ -107,11 +111,31 @@ def closest_index(path, first, last, x, y):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
-def outer_halves(path, offsets, centre, inner_radius, min_points):  # type: ignore[no-untyped-def]
-    """Parts of the tracks outside inner_radius, entries first: begin, end (H,), number of entries.
+def straight_end(turn, outer, inner, margin):  # type: ignore[no-untyped-def]
+    """How far in from its outer end a half track keeps its direction: the first index that is left out.
 
-    The entry half ends where the track first comes inside the radius, the exit half begins where it
-    leaves it last. A track that never comes inside has no half: it does not cross."""
+    Walks from index `outer` towards `inner` and stops where three headings in a row differ by more than TURN from
+    the mean of the outermost third, `margin` points before it."""
+    step = 1 if inner >= outer else -1
+    third = max(abs(inner - outer) // 3, 3)
+    mean = 0.0
+    for j in range(third):
+        mean += turn[outer + step * j] / third
+    run = 0
+    for j in range(abs(inner - outer)):
+        run = run + 1 if abs(unwrap_step(turn[outer + step * j] - mean)) > TURN else 0
+        if run == 3:
+            return outer + step * max(j - 2 - margin, 0)
+    return inner
+
+
+@nb.njit(cache=True)
+def outer_halves(path, turn, offsets, centre, inner_radius, min_points):  # type: ignore[no-untyped-def]
+    """Parts of the tracks on the arms, entries first: begin, end (H,), number of entries.
+
+    The entry half ends where the track first comes inside inner_radius or begins to turn, the exit half begins where
+    it leaves it last or has turned; a half that does not reach out far enough to leave ENOUGH metres comes closer. A
+    track that never comes within inner_radius does not cross."""
     num = len(offsets) - 1
     begin, end = np.zeros(2 * num, np.int64), np.zeros(2 * num, np.int64)
     radius2, count, entries = inner_radius * inner_radius, 0, 0
@@ -121,10 +145,18 @@ def outer_halves(path, offsets, centre, inner_radius, min_points):  # type: igno
             k = closest_index(path, first, last, centre[0], centre[1])
             if (path[k, 0] - centre[0]) ** 2 + (path[k, 1] - centre[1]) ** 2 > radius2:
                 continue
-            step = -1 if side == 0 else 1
-            while first <= k < last and (path[k, 0] - centre[0]) ** 2 + (path[k, 1] - centre[1]) ** 2 < radius2:
+            step, outer = (-1, first) if side == 0 else (1, last - 1)
+            reach = math.hypot(path[outer, 0] - centre[0], path[outer, 1] - centre[1])
+            keep2 = min(max(reach - ENOUGH, LEAST_RADIUS), inner_radius) ** 2
+            while first <= k < last and (path[k, 0] - centre[0]) ** 2 + (path[k, 1] - centre[1]) ** 2 < keep2:
                 k += step
             low, high = (first, k + 1) if side == 0 else (k, last)
+            if high - low < min_points:
+                continue
+            if side == 0:
+                high = straight_end(turn, low, high, MARGIN)
+            else:
+                low = straight_end(turn, high - 1, low, MARGIN)
             if high - low >= min_points:
                 begin[count], end[count] = low, high
                 count += 1

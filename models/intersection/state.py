@@ -62,7 +62,7 @@ class Junction:
     heading_std: float = 0.3  # of a measured heading about the arm [rad]
     clutter: float = 0.02  # share of half tracks on no lane
     clutter_radius: float = 60.0  # where their points are uniform [m]
-    inner_radius: float = 35.0  # points closer to the crossing are on no arm [m]
+    inner_radius: float = 30.0  # points closer to the crossing are on no arm [m]
 
     def __post_init__(self) -> None:
         if self.likelihood != "exact" and self.bend_std > 0:

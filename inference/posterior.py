@@ -79,7 +79,7 @@ class Posterior:
 
     def quantile(self, site: str, q: float) -> Array:
         """Weighted quantile of a site, (*event)."""
-        values = self.draws[site].reshape((-1,) + self.draws[site].shape[2:])
+        values = self.draws[site].reshape((-1, *self.draws[site].shape[2:]))
         order = np.argsort(values, axis=0)
         shares = self.weights.reshape((-1,) + (1,) * (values.ndim - 1))
         ladder = np.cumsum(np.take_along_axis(np.broadcast_to(shares, values.shape), order, 0), 0)
@@ -91,7 +91,7 @@ class Posterior:
         uniform = np.random.default_rng(np.random.SeedSequence(seed)).random()
         log_weights = np.zeros(self.shape) if self.log_weights is None else self.log_weights
         index = weights.systematic(log_weights, num, uniform)
-        return {site: v.reshape((-1,) + v.shape[2:])[index] for site, v in self.draws.items()}
+        return {site: v.reshape((-1, *v.shape[2:]))[index] for site, v in self.draws.items()}
 
     def model_probabilities(self) -> dict[int, float]:
         """Posterior probability of each logical model visited."""
@@ -147,8 +147,8 @@ class Posterior:
         part = lambda head: {k[len(head) :]: v for k, v in arrays.items() if k.startswith(head)}  # noqa: E731
         snapshots = None
         if "snapshots.step" in arrays:
-            columns = (arrays[f"snapshots.{name}"] for name in ("step", "seconds", "log_joint"))
-            snapshots = Snapshots(*columns, part("snapshots/"))
+            step, seconds, log_joint = (arrays[f"snapshots.{name}"] for name in ("step", "seconds", "log_joint"))
+            snapshots = Snapshots(step, seconds, log_joint, part("snapshots/"))
         return Posterior(
             part("draws/"),
             arrays.get("log_weights"),

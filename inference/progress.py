@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 PATIENCE = 2.0  # [s]
 
@@ -29,7 +30,8 @@ class Progress:
 
     def __init__(self, what: str, total: int, show: bool = True) -> None:
         self.what, self.total, self.show = what, total, show
-        self.begin, self.done, self.bar = time.perf_counter(), 0, None
+        self.begin, self.done = time.perf_counter(), 0
+        self.bar: Any = None
 
     def __enter__(self) -> Progress:
         return self

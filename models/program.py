@@ -99,6 +99,11 @@ def quiet_doubles() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
+def _sample_sites(model: Model, evidence: Any) -> dict[str, Site]:
+    nodes: dict[str, Any] = dict(poutine.trace(model).get_trace(evidence).nodes)
+    return {n: site for n, site in nodes.items() if site["type"] == "sample" and not site_is_subsample(site)}
+
+
 def _sites(model: Model, evidence: Any, handler: Messenger) -> dict[str, Site]:
     """Run the program under a handler; its sample sites by name."""
     with quiet_doubles(), handler:
@@ -170,14 +175,10 @@ def simulate(model: Model, evidence: Any, *, num: int, seed: int) -> Latents:
     Sites whose evidence field is None are drawn too. Randomness is local to the call."""
     with torch.random.fork_rng(devices=[]), quiet_doubles():
         torch.manual_seed(seed)
-        once = poutine.trace(model).get_trace(evidence)
-        with pyro.plate("_batch", num, dim=-1 - _plate_dims(once.nodes)):
-            trace = poutine.trace(model).get_trace(evidence)
-    return {
-        name: site["value"]
-        for name, site in trace.nodes.items()
-        if site["type"] == "sample" and not site["is_observed"] and not site_is_subsample(site)
-    }
+        plates = _plate_dims(_sample_sites(model, evidence))
+        with pyro.plate("_batch", num, dim=-1 - plates):
+            sites = _sample_sites(model, evidence)
+    return {name: site["value"] for name, site in sites.items() if not site["is_observed"]}
 
 
 def observe(evidence: Any, draws: Latents) -> tuple[Any, Latents]:
@@ -413,10 +414,10 @@ def bind(model: Model, evidence: Any) -> Bound:
     Raises InputError by name for a latent that no map of normal numbers reaches."""
     with torch.random.fork_rng(devices=[]), quiet_doubles():
         torch.manual_seed(0)
-        nodes = poutine.trace(model).get_trace(evidence).nodes
-    shapes, pads, plate_dims = {}, {}, _plate_dims(nodes)
-    for name, site in nodes.items():
-        if site["type"] == "sample" and not site["is_observed"] and not site_is_subsample(site):
+        sites = _sample_sites(model, evidence)
+    shapes, pads, plate_dims = {}, {}, _plate_dims(sites)
+    for name, site in sites.items():
+        if not site["is_observed"]:
             _to_standard(name, site["fn"], site["value"])
             shapes[name] = site["value"].shape
             pads[name] = plate_dims - (site["value"].dim() - site["fn"].event_dim)

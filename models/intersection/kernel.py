@@ -170,7 +170,7 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     out[0], out[1] = log_prior(z, floats), -math.inf
     if out[0] == -math.inf:
         return
-    z, floats, cache = borrow(z), borrow(floats), borrow(cache)
+    z, floats, cache = borrow(z), borrow(floats), borrow(cache)  # type: ignore[call-arg]
     kind, halves, entries, num = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
     which, keys, turns, scatter, rows, counts, room = memory(cache, halves)
     if kind == POINT:
@@ -250,7 +250,7 @@ def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> 
         return floats, np.array([kind, evidence.num_halves, evidence.entries, 0, 0], dtype=np.int64)
     assert evidence.whole is not None
     points, phi, offsets = evidence.whole.points, evidence.whole.heading, evidence.whole.offsets
-    rows = np.ascontiguousarray(np.vstack([points.T, phi]))
+    rows = np.ascontiguousarray(np.vstack([points.T, np.asarray(phi)]))
     num, margin = len(offsets) - 1, int(model.inner_radius)
     head = [*settings(model), *log_share, model.position_std, heading, 0.0]
     floats = np.concatenate([head, rows.ravel(), prefix_sums(rows, offsets).ravel()])
@@ -311,8 +311,8 @@ def batched_moves(model: Junction) -> tuple[Move, ...]:
         valid = np.empty(len(z), dtype=np.bool_)
         _propose_rows()(kind, z, np.ascontiguousarray(u.numpy()), numbers, none, z_new, u_new, log_q, valid)
         new = {name: torch.from_numpy(np.array(value)) for name, value in unpack(z_new, constants, origin).items()}
-        parts = (torch.from_numpy(np.ascontiguousarray(log_q[:, j])) for j in range(3))
-        return Proposal(new, torch.from_numpy(u_new), *parts, torch.from_numpy(valid))
+        forward, backward, jacobian = torch.from_numpy(log_q).unbind(-1)
+        return Proposal(new, torch.from_numpy(u_new), forward, backward, jacobian, torch.from_numpy(valid))
 
     return tuple(
         Move(moves.NAMES[kind], share, moves.NUM_UNIFORMS, partial(involution, kind))

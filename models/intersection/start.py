@@ -121,3 +121,14 @@ def start_from_halves(model: Junction, evidence: JunctionEvidence) -> dict[str, 
         model.one_way,
     )
     return {name: torch.as_tensor(value) for name, value in unpack(z, model.constants, evidence.origin).items()}
+
+
+def m20_start(model: Junction, evidence: JunctionEvidence) -> dict[str, Any]:
+    """{site: (*event)}: the mean of the points, three arms 120 degrees apart, gap 1 m, one lane each way."""
+    assert evidence.points is not None
+    z = np.zeros(SIZE)
+    z[0], z[1:HEAD] = 3, evidence.points[:2].mean(1).numpy()
+    slots = z[HEAD:].reshape(MAX_ARMS, ARM)
+    slots[:, ANGLE] = np.array([0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0]) * 2.0 * math.pi / 3.0
+    slots[:, GAP], slots[:, ENTRIES], slots[:, EXITS], slots[:, WIDTH] = 1.0, 1.0, 1.0, model.width
+    return {name: torch.as_tensor(value) for name, value in unpack(z, model.constants, evidence.origin).items()}

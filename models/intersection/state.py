@@ -41,12 +41,15 @@ class Junction:
                 current centre, for each half track or for each point: scores for straight arms, not densities.
     steps       'm20' are the moves of Algorithm 1; 'extended' adds small steps, lane toggles and the moves of
                 width, bend and shift.
+    begin       'tracks' starts from the data: arms where half tracks point, lanes where they lie; 'm20' as [M20] might
+                (the paper gives no start): the mean of all points, three arms 120 degrees apart, one lane each way.
     """
 
     dimension: ClassVar[str] = "num_arms"
 
     likelihood: Literal["exact", "half", "point"] = "exact"
     steps: Literal["extended", "m20"] = "extended"
+    begin: Literal["tracks", "m20"] = "tracks"
     one_way: bool = True
     max_lanes: int = 6
     gap_max: float = 8.0  # [m]
@@ -129,10 +132,10 @@ class Junction:
         return batched_moves(self)
 
     def start(self, evidence: Any) -> dict[str, Any]:
-        """A first state from the data: arms where half tracks point, lanes where they lie."""
-        from models.intersection.start import start_from_halves
+        """A first state from the data, see `begin`."""
+        from models.intersection.start import m20_start, start_from_halves
 
-        return start_from_halves(self, evidence)
+        return (start_from_halves if self.begin == "tracks" else m20_start)(self, evidence)
 
     def kernel(self, evidence: Any) -> Kernel:
         """The same density as a compiled kernel over packed states."""

@@ -22,9 +22,9 @@ Array = NDArray[Any]
 acceptance = nb.njit(log_acceptance)
 
 
-def _chain(
+def _chain(  # type: ignore[no-untyped-def]
     propose, evaluate, commit, z, log_terms, best, uniforms, temperatures, setup, floats, ints, cache, draws, counts
-):  # type: ignore[no-untyped-def]
+):
     """Run one chain for len(temperatures) steps, in place.
 
     z (D,) state; log_terms (2,) its log prior and log likelihood; best (D + 1,) best state and its log joint

@@ -107,10 +107,7 @@ def _sample_sites(model: Model, evidence: Any) -> dict[str, Site]:
 def _sites(model: Model, evidence: Any, handler: Messenger) -> dict[str, Site]:
     """Run the program under a handler; its sample sites by name."""
     with quiet_doubles(), handler:
-        trace = poutine.trace(model).get_trace(evidence)
-    return {
-        name: site for name, site in trace.nodes.items() if site["type"] == "sample" and not site_is_subsample(site)
-    }
+        return _sample_sites(model, evidence)
 
 
 def _is_evidence(site: Site) -> bool:

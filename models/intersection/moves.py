@@ -99,11 +99,22 @@ def normal_quantile_low(u):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
+def insertion_sort(values, num):  # type: ignore[no-untyped-def]
+    """Sort the first `num` values in place; for a handful, and quick to compile."""
+    for i in range(1, num):
+        value, j = values[i], i - 1
+        while j >= 0 and values[j] > value:
+            values[j + 1] = values[j]
+            j -= 1
+        values[j + 1] = value
+
+
+@nb.njit(cache=True)
 def free_angles(z, num, out):  # type: ignore[no-untyped-def]
     """Angles at least MIN_SEPARATION from all `num` active arms: their measure; `out` the sorted arms."""
     for a in range(num):
         out[a] = z[HEAD + a * ARM + ANGLE]
-    out[:num].sort()
+    insertion_sort(out, num)
     total = 0.0
     for a in range(num):
         following = out[a + 1] if a < num - 1 else out[0] + 2.0 * math.pi

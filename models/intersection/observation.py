@@ -68,7 +68,7 @@ class TracksOnLanes(TorchDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         z = self._packed()
-        out, points = np.empty((len(z), 2)), value.reshape(-1, 3, value.shape[-1])
+        out, points = np.empty((len(z), 2)), value.reshape(value.shape[:-2].numel(), 3, value.shape[-1])
         for b, observed in enumerate(points):
             rows = z if len(points) == 1 else z[b : b + 1]
             floats, ints = bound_data(self.model, self.evidence, self.evidence._replace(points=observed).moments)

@@ -16,6 +16,7 @@ from models.intersection.angles import MIN_SEPARATION
 from models.intersection.evidence import JunctionEvidence
 from models.intersection.halves import unwrap_step
 from models.intersection.moments import CXS, CYS, MX, MY
+from models.intersection.moves import insertion_sort
 from models.intersection.packing import ANGLE, ARM, ENTRIES, EXITS, GAP, HEAD, MAX_ARMS, MIN_ARMS, SIZE, WIDTH, unpack
 from models.program import InputError
 
@@ -86,7 +87,8 @@ def fill_arms(z, num, mean, directions, entries, width, max_lanes, gap_max, one_
                 z[o + ENTRIES + side] = 0.0 if one_way else 1.0
                 edges[side] = -1.0
                 continue
-            edges[side], z[o + ENTRIES + side] = lane_range(np.sort(offsets[:count]), width, max_lanes)
+            insertion_sort(offsets, count)
+            edges[side], z[o + ENTRIES + side] = lane_range(offsets[:count], width, max_lanes)
         if z[o + ENTRIES] + z[o + EXITS] < 0.5:
             z[o + ENTRIES] = 1.0
         both = edges[0] + edges[1] if edges[0] > -1.0 and edges[1] > -1.0 else 2.0 * max(edges[0], edges[1])

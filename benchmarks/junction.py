@@ -1,0 +1,139 @@
+"""One junction from tracks to a scored estimate, timed: the work that the figures of the intersection count."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.junction_metrics import structure
+from experiments.scenarios.scene import Scene
+from inference import rjmcmc
+from inference.posterior import Posterior
+from inference.progress import Progress
+from models.intersection.packing import MAX_ARMS
+from models.intersection.state import Junction
+from models.intersection.tracks import Tracks
+from models.program import InputError
+
+
+class Effort(NamedTuple):
+    """How much to measure.
+
+    scenes       of the protocol
+    few          scenes of the figures that are reported only
+    timed        scenes that are timed, `repeats` times each
+    real_seeds   simulated drives on every real junction
+    show         progress bars on the standard error
+    """
+
+    scenes: int
+    few: int
+    timed: int
+    repeats: int
+    real_seeds: int
+    show: bool = False
+
+
+FULL = Effort(scenes=1000, few=100, timed=40, repeats=3, real_seeds=5)
+QUICK = Effort(scenes=100, few=50, timed=10, repeats=2, real_seeds=5)
+
+
+class Setting(NamedTuple):
+    """A model, how it is run, and a first state from the tracks where it is not the engine's own."""
+
+    model: Junction
+    knobs: dict[str, Any]
+    first: Callable[[Tracks], dict[str, Any]] | None = None
+
+
+class Trial(NamedTuple):
+    """One scene: the posterior and wall times [s].
+
+    prepare  tracks to evidence, first state and compiled kernel
+    chain    all steps with their random numbers and snapshots
+    polish   greedy search; 0 without
+    total    from tracks to posterior
+    """
+
+    posterior: Posterior
+    prepare: float
+    chain: float
+    polish: float
+    total: float
+
+    @property
+    def us_per_sample(self) -> float:
+        """Time of the chain over its evaluated proposals; invalid ones take time, but do not count."""
+        return 1e6 * self.chain / self.posterior.info["evaluations"]
+
+
+ANNEALED = {"num_chains": 1, "num_steps": 5000, "warmup": 5000, "start": "data", "start_temperature": 10.0}
+DEFAULT = Setting(Junction(), ANNEALED | {"polish": True})
+
+
+def m20_start(tracks: Tracks) -> dict[str, Any]:
+    """Three arms 120 degrees apart at the centroid of the points, gap 1 m, one lane each way; [M20] gives none."""
+    angle = np.linspace(-math.pi, math.pi, MAX_ARMS, endpoint=False)  # inactive slots may hold anything
+    angle[:3] = np.radians([0.0, 120.0, -120.0])
+    ones = np.ones(MAX_ARMS, dtype=np.int64)
+    centre = tracks.points.mean(0)
+    return {"num_arms": 3, "centre": centre, "angle": angle, "gap": np.ones(MAX_ARMS), "entries": ones, "exits": ones}
+
+
+def m20(likelihood: str = "half", acceptance: str = "paper") -> Setting:
+    """[M20] as far as it is printed: its lanes, moves, closest-lane likelihood and acceptance; our start and
+    schedule T = 50 -> 1, prior E, O uniform on 1..6."""
+    model = Junction(likelihood=likelihood, steps="m20", one_way=False, **PAPER_LANES)  # type: ignore[arg-type]
+    steps = {"num_chains": 1, "num_steps": 5000, "warmup": 5000, "start_temperature": 50.0}
+    return Setting(model, steps | {"acceptance": acceptance}, m20_start)
+
+
+PAPER_LANES: dict[str, float] = {"width": 2.7, "width_spread": 0.0, "bend_std": 0.0, "shift_std": 0.0}
+
+
+def attempt(setting: Setting, tracks: Tracks, seed: int) -> Trial:
+    """Run one scene. Raises InputError where the model or the engine refuses the tracks."""
+    began = time.perf_counter()
+    evidence = setting.model.prepare(tracks)
+    first = setting.first(tracks) if setting.first else None
+    prepared = time.perf_counter() - began
+    posterior = rjmcmc.run(setting.model, evidence, seed=seed, init=first, **setting.knobs)
+    total = time.perf_counter() - began
+    assert posterior.snapshots is not None
+    seconds, polished = posterior.snapshots.seconds, setting.knobs.get("polish", False)
+    last = -2 if polished else -1
+    polish = float(seconds[-1] - seconds[-2]) if polished else 0.0
+    return Trial(posterior, prepared + float(seconds[0]), float(seconds[last] - seconds[0]), polish, total)
+
+
+class Scores(NamedTuple):
+    """What came out of many scenes: 1 where the structure is right, share of lane counts right, trials, refusals."""
+
+    right: list[float]
+    lanes: list[float]
+    trials: list[Trial]
+    refused: int
+
+
+def score(setting: Setting, scenes: Iterable[Scene], what: str, total: int, show: bool) -> Scores:
+    """Run every scene with a seed of its own; a scene that is refused is wrong in all."""
+    out = Scores([], [], [], 0)
+    with Progress(what, total, show) as bar:
+        for seed, scene in enumerate(scenes):
+            try:
+                trial = attempt(setting, scene.data, seed)
+            except InputError:
+                right = lanes = 0.0
+                out = out._replace(refused=out.refused + 1)
+            else:
+                marks = structure(trial.posterior.estimate, scene.truth)
+                right, lanes = marks["structure_right"], marks["lanes_right"]
+                out.trials.append(trial)
+            out.right.append(right)
+            out.lanes.append(lanes)
+            bar.advance(1)
+    return out

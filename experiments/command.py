@@ -17,11 +17,12 @@ from typing import Any
 
 import hydra._internal.hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from experiments.schema import check_values, expand, suggest
+from experiments.schema import check_switch, check_values, expand, suggest
 from experiments.signatures import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,9 +39,14 @@ class SchemaLoader(ConfigLoaderImpl):
         expand(config)
         return config
 
-    def load_configuration(self, *args: Any, **kwargs: Any) -> DictConfig:
-        config = super().load_configuration(*args, **kwargs)
+    def load_configuration(
+        self, config_name: str | None, overrides: list[str], *args: Any, **kwargs: Any
+    ) -> DictConfig:
+        config = super().load_configuration(config_name, overrides, *args, **kwargs)
         check_values(config)
+        for override in OverridesParser.create().parse_overrides(overrides):
+            if not override.is_sweep_override() and not override.is_delete():
+                check_switch(config, override.key_or_group, override.value())
         return config
 
 
@@ -49,6 +55,19 @@ hydra._internal.hydra.ConfigLoaderImpl = SchemaLoader  # type: ignore[misc]  # H
 
 class JobFailed(Exception):
     """A run failed and has said why; the argument is the exit code."""
+
+
+class Incomplete(Exception):
+    """A run was stored without what failed after its engine."""
+
+    def __init__(self, folder: Path, failures: dict[str, Exception]) -> None:
+        super().__init__(f"{', '.join(failures)} failed; all else is stored in {folder}")
+        self.failures = failures
+
+
+def in_short(failures: dict[str, Exception]) -> dict[str, str]:
+    """{what failed: one sentence}"""
+    return {what: in_words(error) or f"{type(error).__name__}: {error}" for what, error in failures.items()}
 
 
 def in_words(error: BaseException) -> str | None:
@@ -95,6 +114,11 @@ def _unknown_key(error: Any) -> str:
 
 def complain(error: BaseException, where: str = "waybayes") -> int:
     """Print what went wrong to stderr and return the exit code: 2 for a mistake of use, 1 otherwise."""
+    if isinstance(error, Incomplete):
+        for what, cause in error.failures.items():
+            complain(cause, f"{where}: {what}")
+        print(f"{where}: {error}", file=sys.stderr, flush=True)
+        return 1
     sentence = in_words(error)
     if sentence is None:
         print(f"{where} failed:", file=sys.stderr)

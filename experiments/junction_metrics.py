@@ -83,5 +83,13 @@ def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
     }
 
 
+def label_free(posterior: Posterior) -> dict[str, NDArray[np.float64]]:
+    """What no relabelling of arms changes, {name: (chain, draw)}: lanes in all and the centre [m]."""
+    draws = posterior.draws
+    active = np.arange(draws["entries"].shape[-1]) < draws["num_arms"][..., None]
+    lanes = {f"num_{side}": (draws[side] * active).sum(-1).astype(float) for side in ("entries", "exits")}
+    return lanes | {"centre_x": draws["centre"][..., 0], "centre_y": draws["centre"][..., 1]}
+
+
 def _mean(values: NDArray[np.float64]) -> float:
     return float(values.mean()) if len(values) else float("nan")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import base64
 import math
+import traceback
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
+
+from experiments.command import in_short
 
 if TYPE_CHECKING:
     from experiments.run import Result
@@ -26,19 +29,27 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums } .wide { 
 th, td { text-align: left; padding: .28rem 1.2rem .28rem 0; border-bottom: 1px solid #e4e7ec; vertical-align: top }
 th { color: #667085; font-weight: 600 } td.n { text-align: right }
 .flag { background: #fdf0e7; border-left: 4px solid #d1702c; padding: .5rem .9rem; margin: .4rem 0 }
+.fail { background: #fbe9e9; border-left: 4px solid #b3261e; padding: .5rem .9rem; margin: .4rem 0 }
 .good { background: #ecf5ef; border-left: 4px solid #3b8a5a; padding: .5rem .9rem; margin: .4rem 0 }
 pre { background: #f6f7f9; padding: .9rem; overflow-x: auto; font-size: 13px }
 summary { cursor: pointer; color: #2f6f9f }
 """
 
 
-def write_report(folder: Path, title: str, result: Result, manifest: dict[str, Any]) -> None:
-    """Write figures/*.png and report.html, which embeds them and needs nothing else."""
-    images = save_figures(folder, result.figures)
+def write_report(
+    folder: Path,
+    title: str,
+    result: Result,
+    images: dict[str, str],
+    failures: dict[str, Exception],
+    manifest: dict[str, Any],
+) -> None:
+    """Write report.html, which embeds its images (save_figures) and needs nothing else."""
     info = result.posterior.info
     body = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="sub">scene {escape(result.scene.name)} &middot; {escape(manifest["date"])}</p>',
+        _failures(failures),
         _flags(result.flags),
         "<h2>Scores</h2>",
         table(("metric", "value", "unit"), [(label, v, unit) for (label, unit), v in _labelled(result.scores)]),
@@ -56,16 +67,31 @@ def write_report(folder: Path, title: str, result: Result, manifest: dict[str, A
     (folder / "report.html").write_text(page(title, "".join(body)))
 
 
-def save_figures(folder: Path, figures: dict[str, Any]) -> dict[str, str]:
-    """Write figures/*.png; {name: <img> with the picture inside}."""
-    images = {}
+def save_figures(folder: Path, figures: dict[str, Any]) -> tuple[dict[str, str], dict[str, Exception]]:
+    """Write figures/*.png; {name: <img> with the picture inside}, and what matplotlib could not draw."""
+    images, failures = {}, {}
     for name, figure in figures.items():
         file = folder / "figures" / f"{name}.png"
         file.parent.mkdir(exist_ok=True)
-        figure.savefig(file, dpi=130)
+        try:
+            figure.savefig(file, dpi=130)
+        except Exception as error:  # only here does a figure really draw
+            file.unlink(missing_ok=True)
+            failures[f"figure {name}"] = error
+            continue
         data = base64.b64encode(file.read_bytes()).decode()
         images[name] = f'<img alt="{escape(name)}" src="data:image/png;base64,{data}">'
-    return images
+    return images, failures
+
+
+def _failures(failures: dict[str, Exception]) -> str:
+    """What is missing from the page, and why."""
+    boxes = []
+    for what, error in failures.items():
+        trace = escape("".join(traceback.format_exception(error)))
+        head = f"{escape(what)} failed: {escape(in_short({what: error})[what])}"
+        boxes.append(f'<div class="fail">{head}<details><summary>traceback</summary><pre>{trace}</pre></details></div>')
+    return "".join(boxes)
 
 
 def _labelled(scores: dict[str, float]) -> list[tuple[tuple[str, str], float]]:
@@ -79,7 +105,9 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def number(value: Any) -> str:
-    """Four digits, without noise."""
+    """Four digits, without noise; a dash where there is nothing to say."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value)
     if isinstance(value, int) or (math.isfinite(value) and value == int(value) and abs(value) < 1e9):
@@ -91,7 +119,9 @@ def table(head: tuple[str, ...], rows: list[Any]) -> str:
     """An HTML table; numbers are aligned to the right."""
     if not rows:
         return "<p>none</p>"
-    cell = lambda v: f'<td class="n">{number(v)}</td>' if isinstance(v, int | float) else f"<td>{escape(str(v))}</td>"  # noqa: E731
+    cell = lambda v: (
+        f'<td class="n">{number(v)}</td>' if isinstance(v, int | float) else f"<td>{escape(number(v))}</td>"
+    )  # noqa: E731
     lines = ["<tr>" + "".join(cell(value) for value in row) + "</tr>" for row in rows]
     top = "".join(f"<th>{escape(name)}</th>" for name in head)
     return f'<div class="wide"><table><tr>{top}</tr>{"".join(lines)}</table></div>'

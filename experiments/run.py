@@ -13,6 +13,8 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,7 +24,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from experiments import store
-from experiments.command import JobFailed, complain, guarded, plain
+from experiments.command import Incomplete, JobFailed, complain, guarded, in_short, plain
 from experiments.schema import build
 
 if TYPE_CHECKING:  # torch and matplotlib take seconds to import: help and skipped runs need neither
@@ -34,6 +36,7 @@ if TYPE_CHECKING:  # torch and matplotlib take seconds to import: help and skipp
 Engine = Callable[..., "Posterior"]
 Metric = Callable[["Posterior", "Scene"], dict[str, float]]
 Draw = Callable[["Posterior", "Scene"], dict[str, "Figure"]]
+Functional = Callable[["Posterior"], dict[str, Any]]
 
 
 class Result(NamedTuple):
@@ -44,6 +47,7 @@ class Result(NamedTuple):
     flags        what speaks against the draws, in words
     figures      {name: figure}
     seconds      {stage: seconds}
+    failures     {what failed once the engine had run: its exception}; the rest is complete
     """
 
     scene: Scene
@@ -53,6 +57,7 @@ class Result(NamedTuple):
     flags: list[str]
     figures: dict[str, Figure]
     seconds: dict[str, float]
+    failures: dict[str, Exception]
 
 
 def run(
@@ -61,15 +66,22 @@ def run(
     engine: Engine,
     *,
     seed: int = 0,
+    functionals: Iterable[Functional] = (),
     metrics: Iterable[Metric] = (),
     figures: Iterable[Draw] = (),
     say: Callable[[str], None] = lambda line: None,
 ) -> Result:
-    """Run one experiment. Raises InputError where scenario, model and engine do not fit."""
+    """Run one experiment. Raises InputError where scenario, model and engine do not fit.
+
+    functionals  posterior -> {name: (chain, draw)}, further scalars for the diagnostics: where slots hold
+                 a set, only what no relabelling changes can be compared between draws
+
+    What fails once the engine has run takes nothing else with it: it is listed under `failures`."""
     from inference import diagnostics
     from models.program import check
 
     seconds: dict[str, float] = {}
+    failures: dict[str, Exception] = {}
 
     @contextmanager
     def stage(name: str) -> Any:
@@ -77,24 +89,42 @@ def run(
         yield
         seconds[name] = time.perf_counter() - start
 
+    def attempt(what: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        try:
+            return work()
+        except Exception as error:
+            failures[what] = error
+            return {}
+
+    def collect(kind: str, functions: Iterable[Callable[..., dict[str, Any]]], *given: Any) -> dict[str, Any]:
+        parts = [attempt(f"{kind} {_name(function)}", partial(function, *given)) for function in functions]
+        return {name: value for part in parts for name, value in part.items()}
+
     with stage("scenario"):
         scene = scenario()
     say(f"scenario   {scene.name}")
     with stage("prepare"):
+        check_reads(model, scene.data)
         evidence = model.prepare(scene.data) if hasattr(model, "prepare") else scene.data
-        check_reads(model, evidence)
         check(model, evidence)
     say(f"model      {type(model).__name__}")
     with stage("engine"):
         posterior = engine(model, evidence, seed=engine_seed(seed))
     say(f"posterior  {' x '.join(map(str, posterior.shape))} draws in {seconds['engine']:.2f} s")
     with stage("metrics"):
-        scores = {name: float(value) for metric in metrics for name, value in metric(posterior, scene).items()}
+        scores = {name: float(value) for name, value in collect("metric", metrics, posterior, scene).items()}
     with stage("diagnostics"):
-        summary, flags = diagnostics.summary(posterior), diagnostics.flags(posterior)
+        scalars = collect("functional", functionals, posterior)
+        judged = replace(posterior, draws=posterior.draws | scalars)
+        found = attempt("diagnostics", lambda: {"summary": diagnostics.summary(judged)})
+        found |= attempt("flags", lambda: {"flags": diagnostics.flags(judged)})
     with stage("figures"):
-        drawn = {name: figure for draw in figures for name, figure in draw(posterior, scene).items()}
-    return Result(scene, posterior, scores, summary, flags, drawn, seconds)
+        drawn = collect("figure", figures, posterior, scene)
+    return Result(scene, posterior, scores, found.get("summary", {}), found.get("flags", []), drawn, seconds, failures)
+
+
+def _name(function: Any) -> str:
+    return str(getattr(getattr(function, "func", function), "__name__", function))
 
 
 def engine_seed(seed: int) -> int:
@@ -104,17 +134,18 @@ def engine_seed(seed: int) -> int:
     return int(np.random.SeedSequence(seed).spawn(1)[0].generate_state(1)[0])
 
 
-def check_reads(model: Any, evidence: Any) -> None:
-    """Raise InputError where a model's annotation says that it reads another kind of evidence."""
+def check_reads(model: Any, data: Any) -> None:
+    """Raise InputError where a model's annotation, of prepare() if it has one, says that it reads other data."""
     from typing import get_type_hints
 
     from models.program import InputError
 
-    expected = get_type_hints(type(model).__call__).get("evidence")
-    if isinstance(expected, type) and not isinstance(evidence, expected):
+    reads = getattr(type(model), "prepare", type(model).__call__)
+    expected = next((hint for name, hint in get_type_hints(reads).items() if name != "return"), Any)
+    if isinstance(expected, type) and expected is not Any and not isinstance(data, expected):
         raise InputError(
             f"model {type(model).__name__} reads {expected.__name__}, but the scenario gives "
-            f"{type(evidence).__name__}; choose a scenario that fits the model"
+            f"{type(data).__name__}; choose a scenario that fits the model"
         )
 
 
@@ -139,33 +170,49 @@ def job_of(config: DictConfig, choices: dict[str, str]) -> Job:
 
 
 def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
-    """Run a job and store its outcome, or read it where that is done already; the scores."""
+    """Run a job and store its outcome, or read it where that is done already; the scores.
+
+    Raises Incomplete, all else being stored, where something failed after the engine."""
     if store.is_done(job.folder) and not job.force:
         say(f"done already: {job.folder} (force=true runs it again)")
         return dict(store.read_json(job.folder / "scores.json"))
-    from experiments.report import write_report
-
-    parts = {key: build(job.config[key], key) for key in ("model", "engine", "metrics", "figures")}
+    parts = {key: build(job.config[key], key) for key in ("model", "engine", "functionals", "metrics", "figures")}
     scenario = job.config["scenario"]
     result = run(lambda: build(scenario, "scenario"), **parts, seed=job.config["seed"], say=say)
+    failures = write(job, result)
+    if failures:
+        raise Incomplete(job.folder, failures)
+    return result.scores
+
+
+def write(job: Job, result: Result) -> dict[str, Exception]:
+    """Store a result in the folder of its job; all failures, those of writing figures and report included."""
+    from experiments.report import save_figures, write_report
+
     seeds = {"run": job.config["seed"], "engine": engine_seed(job.config["seed"])}
     with store.writing(job.folder) as folder:
         store.write_json(folder / "scores.json", result.scores)
         store.write_json(folder / "diagnostics.json", {"summary": result.diagnostics, "flags": result.flags})
         result.posterior.save(folder)
         manifest = store.manifest(job.name, job.config, seeds, result.seconds, result.scene.info)
-        write_report(folder, job.name, result, manifest)
-        store.write_json(folder / "manifest.json", manifest)
-    return result.scores
+        images, unsaved = save_figures(folder, result.figures)
+        failures = result.failures | unsaved
+        try:
+            write_report(folder, job.name, result, images, failures, manifest)
+        except Exception as error:
+            failures["report"] = error
+        store.write_json(folder / "manifest.json", manifest | {"failures": in_short(failures)})
+    return failures
 
 
-def show(scores: dict[str, float], folder: Path) -> None:
-    """Print the scores, what speaks against the draws, and where the report is."""
+def show(folder: Path) -> None:
+    """Print the scores of a stored run, what speaks against its draws, and where the report is."""
     from rich.console import Console
     from rich.table import Table
 
     from experiments.report import number, split_unit
 
+    scores = store.read_json(folder / "scores.json")
     table = Table("metric", "value", "unit")
     for name, value in scores.items():
         label, unit = split_unit(name)
@@ -187,7 +234,12 @@ def _launch(config: DictConfig) -> None:
     known = HydraConfig.get()
     try:
         job = job_of(config, known.runtime.choices)
-        show(execute(job), job.folder)
+        try:
+            execute(job)
+        except Incomplete:
+            show(job.folder)
+            raise
+        show(job.folder)
     except Exception as error:
         code = complain(error, " ".join(["waybayes", *known.overrides.task]))
         if known.mode == RunMode.MULTIRUN:

@@ -55,6 +55,9 @@ def expand(config: DictConfig) -> None:
     that a target does not take; OmegaConf raises for a value of the wrong type."""
     for parent, key, path, node in list(_targets(config)):
         allowed = _allowed(path, node)
+        for name, knob in allowed.items():
+            if knob.kind is bool and name in node and not OmegaConf.is_missing(node, name):
+                _refuse_number(f"{path}.{name}", node[name])
         entries: list[Any] = [("_target_", str, node["_target_"])]
         entries += [("_partial_", bool, field(default=True))] if node.get("_partial_", False) else []
         entries += [(k.name, k.kind, _default(k.default)) for k in allowed.values()]
@@ -80,6 +83,19 @@ def _default(value: Any) -> Any:
     if isinstance(value, dict):
         return field(default_factory=lambda: dict(value))
     return field(default=value)
+
+
+def check_switch(config: DictConfig, key: str, value: Any) -> None:
+    """Raise ConfigError for a number where a switch is: OmegaConf takes every number but 0 for true."""
+    parent, _, name = key.rpartition(".")
+    node = OmegaConf.select(config, parent) if parent else config
+    if isinstance(node, DictConfig) and name in node and isinstance(node._get_node(name), BooleanNode):
+        _refuse_number(key, value)
+
+
+def _refuse_number(key: str, value: Any) -> None:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        raise ConfigError(f"{key} is a switch, but is {value}; give true or false")
 
 
 def check_values(config: DictConfig) -> None:

@@ -83,8 +83,9 @@ def writing(folder: Path) -> Iterator[Path]:
 
 
 def is_done(folder: Path) -> bool:
-    """Whether a folder holds a completed run."""
-    return (folder / "manifest.json").is_file()
+    """Whether a folder holds a completed run, nothing failed in it."""
+    file = folder / "manifest.json"
+    return file.is_file() and not read_json(file).get("failures")
 
 
 def manifest(

@@ -17,7 +17,7 @@ test: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not slow"
 
 test-long: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m slow
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m slow || [ $$? -eq 5 ] # 5: no slow test is left
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks.intersection

@@ -162,23 +162,29 @@ def anytime(posterior: Posterior, scene: Scene) -> Figure:
     snapshots = posterior.snapshots
     assert snapshots is not None
     figure = Figure(figsize=(7.2, 3.6 if scene.truth is None else 5.2), layout="constrained")
-    milliseconds = 1e3 * snapshots.seconds
+    milliseconds = _since_first(snapshots.seconds)
     if scene.truth is None:
         upper = figure.add_subplot()
     else:
         upper, lower = figure.subplots(2, 1, sharex=True)
         _draw_errors(lower, milliseconds, _scores(snapshots.states, scene.truth))
-        lower.set_xlabel("time [ms]")
         upper.tick_params(labelbottom=False)
     below = snapshots.log_joint.max() - snapshots.log_joint
     upper.step(milliseconds, below, where="post", color=ENTRY, lw=1.6)
     upper.set_yscale("symlog", linthresh=1.0)
     upper.set(ylabel="log joint below\nits best value [nats]", ylim=(0, None))
     upper.set_title(f"{scene.name}: best state so far", loc="left", color=INK, fontsize=11)
-    if scene.truth is None:
-        upper.set_xlabel("time [ms]")
+    figure.axes[-1].set(xscale="log", xlabel="time since the first state [ms]")
     _quiet(upper)
     return figure
+
+
+def _since_first(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Milliseconds since the first snapshot; that one stands where a logarithm can show it."""
+    milliseconds = 1e3 * (seconds - seconds[0])
+    if len(seconds) > 1:
+        milliseconds[0] = milliseconds[1] / 2
+    return milliseconds
 
 
 def _scores(states: dict[str, NDArray[Any]], truth: JunctionTruth) -> list[dict[str, float]]:
@@ -191,7 +197,7 @@ def _draw_errors(axes: Axes, milliseconds: NDArray[np.float64], scores: list[dic
     arms = [1.0 - score["arms_right"] for score in scores]
     axes.step(milliseconds, lanes, where="post", color=EXIT, lw=1.6, label="lane counts wrong (share)")
     axes.fill_between(milliseconds, arms, step="post", color=TRACK, alpha=0.25, lw=0, label="arms wrong")
-    axes.set(ylim=(-0.03, 1.05), ylabel="error")
+    axes.set(ylim=(-0.03, max(0.3, 1.1 * max(lanes))), ylabel="error")
     axes.legend(frameon=False, fontsize=9, loc="upper right")
     _quiet(axes)
 

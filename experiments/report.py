@@ -119,12 +119,14 @@ def table(head: tuple[str, ...], rows: list[Any]) -> str:
     """An HTML table; numbers are aligned to the right."""
     if not rows:
         return "<p>none</p>"
-    cell = lambda v: (
-        f'<td class="n">{number(v)}</td>' if isinstance(v, int | float) else f"<td>{escape(number(v))}</td>"
-    )  # noqa: E731
-    lines = ["<tr>" + "".join(cell(value) for value in row) + "</tr>" for row in rows]
+    lines = ["<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows]
     top = "".join(f"<th>{escape(name)}</th>" for name in head)
     return f'<div class="wide"><table><tr>{top}</tr>{"".join(lines)}</table></div>'
+
+
+def _cell(value: Any) -> str:
+    kind = ' class="n"' if value is None or isinstance(value, int | float) else ""
+    return f"<td{kind}>{escape(number(value))}</td>"
 
 
 def _flags(flags: list[str]) -> str:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+import traceback
+from statistics import median
 from typing import TYPE_CHECKING
 
 from benchmarks import figure as fig
@@ -23,7 +25,7 @@ REFERENCE = fig.Figure(
     "reference_loop_ns",
     "ns",
     f"one iteration of x <- exp(-x), {LOOP} in a row in machine code: a yardstick of the machine for all times; "
-    "mean of before and after",
+    "median of readings before and after",
 )
 
 
@@ -50,12 +52,16 @@ def select(only: list[str]) -> list[fig.Measurement]:
 
 def measure(chosen: list[fig.Measurement], effort: Effort) -> tuple[list[fig.Figure], fig.Values]:
     """Figures and their values, the yardstick taken before and after."""
-    before = reference_loop_ns()
+    readings = reference_loop_ns()
     values: fig.Values = {}
     for measurement in chosen:
-        values |= measurement.measure(effort)
-    after = reference_loop_ns()
-    yardstick = fig.Value((before + after) / 2, f"before {before:.2f}, after {after:.2f}")
+        try:
+            values |= measurement.measure(effort)
+        except Exception as error:  # what is measured already must not be lost
+            traceback.print_exc()
+            values |= {f.key: fig.Value(None, f"failed: {error}") for f in measurement.figures}
+    readings += reference_loop_ns()
+    yardstick = fig.Value(median(readings), f"{min(readings):.2f} to {max(readings):.2f}: far apart on a busy machine")
     return [REFERENCE, *(f for m in chosen for f in m.figures)], {REFERENCE.key: yardstick} | values
 
 

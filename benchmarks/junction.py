@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -84,15 +86,30 @@ def m20_start(tracks: Tracks) -> dict[str, Any]:
     return {"num_arms": 3, "centre": centre, "angle": angle, "gap": np.ones(MAX_ARMS), "entries": ones, "exits": ones}
 
 
-def m20(likelihood: str = "half", acceptance: str = "paper") -> Setting:
-    """[M20] as far as it is printed: its lanes, moves, closest-lane likelihood and acceptance; our start and
-    schedule T = 50 -> 1, prior E, O uniform on 1..6."""
-    model = Junction(likelihood=likelihood, steps="m20", one_way=False, **PAPER_LANES)  # type: ignore[arg-type]
+@lru_cache
+def configured(name: str) -> Junction:
+    """The model of the config model=NAME."""
+    from hydra import compose, initialize_config_module
+    from hydra.utils import instantiate
+
+    with initialize_config_module("configs", version_base="1.3"):
+        model = instantiate(compose("run", [f"model={name}"]).model)
+    assert isinstance(model, Junction)
+    return model
+
+
+def m20(likelihood: Literal["half", "point"] = "half", acceptance: Literal["paper", "printed"] = "paper") -> Setting:
+    """[M20] as far as it is printed (config model=junction_m20), with our start and schedule T = 50 -> 1."""
+    model = replace(configured("junction_m20"), likelihood=likelihood)
     steps = {"num_chains": 1, "num_steps": 5000, "warmup": 5000, "start_temperature": 50.0}
     return Setting(model, steps | {"acceptance": acceptance}, m20_start)
 
 
-PAPER_LANES: dict[str, float] = {"width": 2.7, "width_spread": 0.0, "bend_std": 0.0, "shift_std": 0.0}
+def paper_lanes() -> Junction:
+    """The default model with the lanes of [M20]: width known, straight arms through one centre."""
+    paper = configured("junction_m20")
+    lanes = {name: getattr(paper, name) for name in ("width", "width_spread", "bend_std", "shift_std")}
+    return replace(Junction(), **lanes)
 
 
 def attempt(setting: Setting, tracks: Tracks, seed: int) -> Trial:

@@ -6,10 +6,8 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 
-import yaml
-
 from benchmarks.figure import Figure, Measurement, Value, Values, share
-from benchmarks.junction import ANNEALED, DEFAULT, PAPER_LANES, Effort, Scores, Setting, attempt, m20, score
+from benchmarks.junction import ANNEALED, DEFAULT, Effort, Scores, Setting, attempt, configured, m20, paper_lanes, score
 from benchmarks.timing import p95
 from experiments.scenarios.junction import DATA_ROOT, junction, names
 from experiments.scenarios.protocol import protocol
@@ -143,23 +141,13 @@ ANYTIME = Measurement(
 )
 
 
-def real_model() -> Junction:
-    """The intersection for real junctions: that of the config model=junction_real where there is one, else a wide prior
-    (gaps up to 25 m, arms up to metres beside the centre)."""
-    file = ROOT / "configs" / "model" / "junction_real.yaml"
-    if file.exists():
-        settings = yaml.safe_load(file.read_text())
-        return Junction(**{name: value for name, value in settings.items() if not name.startswith("_")})
-    return Junction(gap_max=25.0, shift_std=1.5, width=3.3, bend_std=0.005)
-
-
 def real(effort: Effort) -> Values:
     keys = [figure.key for figure in REAL.figures]
     try:
         clean = names("clean", DATA)
     except InputError as absent:
         return {key: Value(None, f"skipped: {absent}") for key in keys}
-    setting, seeds = DEFAULT._replace(model=real_model()), range(effort.real_seeds)
+    setting, seeds = DEFAULT._replace(model=configured("junction_real")), range(effort.real_seeds)
     by_name: dict[str, float] = {}
     right: list[float] = []
     lanes: list[float] = []
@@ -182,7 +170,7 @@ REAL = Measurement(
             "structure_real",
             "share",
             "share of drives with every arm and lane count right: vehicles simulated on the real centre lines of the "
-            "junctions marked clean, positions only, wide prior, 5000 steps, polish",
+            "junctions marked clean, positions only, config model=junction_real, else as structure_5000",
         ),
         Figure("lanes_real", "share", "share of the entry and exit counts of all arms right, same runs"),
         Figure("structure_real_names", "share", "structure_real junction by junction"),
@@ -198,7 +186,7 @@ MEASUREMENTS = (
     variant(
         "structure_w27_5000",
         "as structure_5000, lane width known to be 2.7 m and straight arms through one centre, as in [M20]",
-        DEFAULT._replace(model=Junction(**PAPER_LANES)),  # type: ignore[arg-type]
+        DEFAULT._replace(model=paper_lanes()),
     ),
     variant("structure_10000", "as structure_5000, 10000 steps", with_steps(DEFAULT, 10000)),
     variant(

@@ -76,7 +76,7 @@ def brute_exact(model: Junction, z: Latents, evidence: JunctionEvidence) -> floa
     points, centre = evidence.points.numpy(), z["centre"].numpy() - evidence.origin
     total = 0.0
     for h in range(evidence.num_halves):
-        side = 1 if h < evidence.entries else -1
+        side = 1 if h < evidence.num_entries else -1
         rows = slice(evidence.starts[h], evidence.starts[h + 1])
         y, s = points[:, rows], evidence.s[rows]
         options = list(lanes(model, z, side))

@@ -25,19 +25,19 @@ MIN_POINTS = 8  # of a half track
 class JunctionEvidence(NamedTuple):
     """Half tracks, entries first.
 
-    points   (3, N) x, y about the origin [m] and heading [rad], half by half; None simulates
-    s        (N,) distance from the origin along the lane [m]: a fixed covariate
-    starts   (H + 1,) half h holds points starts[h]:starts[h + 1]
-    entries  number of entry halves
-    origin   (2,) where the tracks meet [m]
-    heading  whether headings were measured
-    whole    the tracks as given, about the origin: [M20]'s likelihoods split them at the latent centre
+    points       (3, N) x, y about the origin [m] and heading [rad], half by half; None simulates
+    s            (N,) distance from the origin along the lane [m]: a fixed covariate
+    starts       (H + 1,) half h holds points starts[h]:starts[h + 1]
+    num_entries  of the halves; not `entries`, which is a site of the program
+    origin       (2,) where the tracks meet [m]
+    heading      whether headings were measured
+    whole        the tracks as given, about the origin: [M20]'s likelihoods split them at the latent centre
     """
 
     points: Tensor | None
     s: Array
     starts: NDArray[np.int64]
-    entries: int
+    num_entries: int
     origin: Array
     heading: bool
     whole: Tracks | None

@@ -247,7 +247,7 @@ def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> 
         stray = stray if model.clutter > 0 else np.full_like(stray, 0.1 * density.NO_LANE)
         head = [*settings(model), *log_share, model.position_std, heading, front.sum()]
         floats = np.concatenate([head, scaled(evidence, observed, model).ravel(), stray])
-        return floats, np.array([kind, evidence.num_halves, evidence.entries, 0, 0], dtype=np.int64)
+        return floats, np.array([kind, evidence.num_halves, evidence.num_entries, 0, 0], dtype=np.int64)
     assert evidence.whole is not None
     points, phi, offsets = evidence.whole.points, evidence.whole.heading, evidence.whole.offsets
     rows = np.ascontiguousarray(np.vstack([points.T, np.asarray(phi)]))

@@ -94,7 +94,7 @@ def _draw_points(model: Junction, evidence: JunctionEvidence, one: dict[str, Ten
     """One draw of all points (3, N): labels, then common offsets, then points (moments.py, top)."""
     num_halves, noise = evidence.num_halves, model.noise
     half = torch.repeat_interleave(torch.arange(num_halves), torch.from_numpy(np.diff(evidence.starts)))
-    incoming = torch.arange(num_halves) < evidence.entries
+    incoming = torch.arange(num_halves) < evidence.num_entries
     active = (torch.arange(MAX_ARMS) < one["num_arms"]).double()
     field = lambda name: one[name] if name in one else torch.full((MAX_ARMS,), model.constants[name])  # noqa: E731
     arm = torch.zeros(num_halves, dtype=torch.long)

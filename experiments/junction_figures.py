@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from experiments.junction_metrics import Estimate, structure
+from experiments.junction_metrics import Estimate, driven_arms, structure
 from experiments.scenarios import paths
 from experiments.scenarios.protocol import ARM_LENGTH, interior_radius
 from experiments.scenarios.scene import JunctionTruth, Scene
@@ -208,7 +208,7 @@ def arm_count(posterior: Posterior, scene: Scene) -> Figure:
     support = np.arange(2, max(7, counts.max()) + 1)
     weights = posterior.weights.reshape(-1)
     probability = np.array([weights[counts == k].sum() for k in support])
-    true = None if scene.truth is None else len(scene.truth.angle)
+    true = None if scene.truth is None else int(driven_arms(scene.truth).sum())
     figure = Figure(figsize=(4.8, 3.2), layout="constrained")
     axes = figure.add_subplot()
     bars = axes.bar(support, probability, width=0.62, color=[ENTRY if k == true else "#b9c7d6" for k in support])

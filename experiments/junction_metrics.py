@@ -23,7 +23,7 @@ TOLERANCE_DEG = 10.0  # between the directions of an estimated arm and its true 
 
 
 def structure(estimate: Estimate, truth: JunctionTruth, tolerance_deg: float = TOLERANCE_DEG) -> dict[str, float]:
-    """Compare one state with the truth.
+    """Compare one state with the truth, its K arms being those that vehicles used.
 
     arms_right       1 where as many arms as true, each within the tolerance of its own true arm
     structure_right  1 where moreover the entries and exits of every arm are right
@@ -33,14 +33,18 @@ def structure(estimate: Estimate, truth: JunctionTruth, tolerance_deg: float = T
     gap_error_m      mean over matched arms with a known gap, nan where there is none
     """
     slots, arms, difference = match(estimate, truth, tolerance_deg)
+    extra = int(estimate["num_arms"]) - len(arms)
+    driven = driven_arms(truth)
+    scored = driven[arms]
+    slots, arms, difference = slots[scored], arms[scored], difference[scored]
     entries = np.asarray(estimate["entries"])[slots] == truth.entries[arms]
     exits = np.asarray(estimate["exits"])[slots] == truth.exits[arms]
-    arms_right = len(arms) == len(truth.angle) == int(estimate["num_arms"])
+    arms_right = len(arms) == driven.sum() and extra == 0
     gaps = np.abs(np.asarray(estimate["gap"])[slots] - truth.gap[arms])
     return {
         "arms_right": float(arms_right),
         "structure_right": float(arms_right and entries.all() and exits.all()),
-        "lanes_right": float(entries.sum() + exits.sum()) / (2 * len(truth.angle)),
+        "lanes_right": float(entries.sum() + exits.sum()) / max(2 * int(driven.sum()), 1),
         "angle_error_deg": _mean(np.degrees(difference)),
         "centre_error_m": float(np.linalg.norm(np.asarray(estimate["centre"]) - truth.centre)),
         "gap_error_m": _mean(gaps[np.isfinite(gaps)]),
@@ -73,7 +77,7 @@ def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
         return {}
     weights = posterior.weights.reshape(-1)
     draws = {site: values.reshape((-1, *values.shape[2:])) for site, values in posterior.draws.items()}
-    right_count = draws["num_arms"] == len(truth.angle)
+    right_count = draws["num_arms"] == driven_arms(truth).sum()
     right_lanes = 0.0
     for i in np.flatnonzero(right_count):
         right_lanes += weights[i] * structure({s: v[i] for s, v in draws.items()}, truth)["structure_right"]
@@ -81,6 +85,11 @@ def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
         "arm_count_probability": float(weights[right_count].sum()),
         "lane_counts_probability": float(right_lanes),
     }
+
+
+def driven_arms(truth: JunctionTruth) -> NDArray[np.bool_]:
+    """The arms that can be found, (K,)."""
+    return np.ones(len(truth.angle), dtype=bool) if truth.driven is None else truth.driven
 
 
 def label_free(posterior: Posterior) -> dict[str, NDArray[np.float64]]:

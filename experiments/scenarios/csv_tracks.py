@@ -56,8 +56,13 @@ def csv(path: str, min_length: float = MIN_LENGTH) -> Scene:
     long = [piece for piece, length in zip(pieces, lengths, strict=True) if length >= min_length]
     if not long:
         raise InputError(
-            f"{path}: no vehicle crosses a junction, the longest of {len(vehicles)} tracks is {max(lengths):.1f} m "
-            f"and min_length is {min_length:g} m; give longer tracks or lower scenario.min_length"
+            f"{path}: no vehicle crosses a junction, the longest of {len(vehicles)} tracks is {max(lengths):.1f} m and "
+            f"min_length is {min_length:g} m; give longer tracks, in metres, or lower scenario.min_length"
+        )
+    if _on_one_road([points for points, _ in long]):
+        raise InputError(
+            f"{path}: no vehicle crosses another's way, all {len(long)} tracks of {min_length:g} m and more run along "
+            "one road; give tracks that enter and leave the junction by different arms"
         )
     data = join(long)
     info = {
@@ -69,6 +74,30 @@ def csv(path: str, min_length: float = MIN_LENGTH) -> Scene:
         "heading": "none" if data.heading is None else "measured",
     }
     return Scene(data, None, Path(path).name, info)
+
+
+def _on_one_road(tracks: list[Floats]) -> bool:
+    """Whether the chords of all tracks lie within 15 degrees of one line, whichever way they are driven."""
+    chords = np.array([points[-1] - points[0] for points in tracks])
+    twice = 2 * np.arctan2(chords[:, 1], chords[:, 0])  # opposite directions are one
+    mean = np.arctan2(np.sin(twice).sum(), np.cos(twice).sum())
+    return bool((np.abs(paths.wrap(twice - mean)) < 2 * math.radians(15.0)).all())
+
+
+def write(path: str | Path, tracks: Tracks, step: float = 0.1) -> None:
+    """Write tracks as the table that `read` reads, their points `step` seconds apart.
+
+    Raises InputError where there are no tracks."""
+    if len(tracks.offsets) < 2:
+        raise InputError(f"{path}: there are no tracks to write")
+    heading = [] if tracks.heading is None else [tracks.heading]
+    columns = np.column_stack([tracks.points, *heading])
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        rows = table.writer(file)
+        rows.writerow([*REQUIRED, *["heading" for _ in heading]])
+        for vehicle, (begin, end) in enumerate(zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True)):
+            for i in range(begin, end):
+                rows.writerow([vehicle, f"{(i - begin) * step:.6g}", *(f"{value:.6f}" for value in columns[i])])
 
 
 def join(pieces: list[tuple[Floats, Floats | None]]) -> Tracks:

@@ -44,6 +44,7 @@ class JunctionTruth(NamedTuple):
     lines        L centre lines (n, 2) in driving order, a point every 0.25 m
     connections  (L, 4) entry arm, entry lane, exit arm, exit lane of each line
     track_lane   (T,) the line each track drove, -1 where unknown
+    driven       (K,) arms that vehicles used; None where all are: only these can be found
     """
 
     centre: Floats
@@ -56,6 +57,7 @@ class JunctionTruth(NamedTuple):
     lines: list[Floats]
     connections: Ints
     track_lane: Ints
+    driven: NDArray[np.bool_] | None = None
 
 
 def join_tracks(points: list[Floats], headings: list[Floats] | None) -> Tracks:

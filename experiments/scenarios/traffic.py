@@ -1,7 +1,7 @@
 """Recorded vehicles at real junctions: drone and tower video, real behaviour, real noise.
 
-The truth is the map's; recorded traffic agrees with it within 0.3 to 0.9 m only, and not every lane
-is driven on.
+The truth is the map's; recorded traffic agrees with it within 0.3 to 0.9 m only. Arms that nobody
+drove are not scored, but a driven arm is scored with all its lanes, though not every lane is driven on.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.scenarios import csv_tracks, junction
+from experiments.scenarios import csv_tracks, junction, paths
 from experiments.scenarios.csv_tracks import MIN_LENGTH
 from experiments.scenarios.protocol import counts
-from experiments.scenarios.scene import Scene
+from experiments.scenarios.scene import Floats, Scene
 from models.program import InputError
 
 RADIUS = 60.0  # what counts as part of the junction, as the arms of the protocol [m]
@@ -43,16 +43,27 @@ def traffic(name: str = "lankershim_2", data_root: str = junction.DATA_ROOT, hea
             "of the centre; choose another recording"
         )
     data = csv_tracks.join(pieces)
-    truth = truth._replace(track_lane=np.full(len(pieces), -1, dtype=np.int64))
+    driven = driven_arms([points for points, _ in pieces], truth.angle)
+    truth = truth._replace(track_lane=np.full(len(pieces), -1, dtype=np.int64), driven=driven)
     info = {
         "scenario": "traffic",
         "recording": name,
         "quality": quality,
         "vehicles": len(vehicles),
         "heading": "none" if data.heading is None else "measured",
+        "driven_arms": int(driven.sum()),
         **counts(truth, data),
     }
     return Scene(data, truth, f"{name} (recorded)", info)
+
+
+def driven_arms(tracks: list[Floats], angle: Floats) -> NDArray[np.bool_]:
+    """Arms (K,) towards which two or more tracks begin or end, 25 m or more from the centre and within 15 degrees."""
+    ends = np.array([end for points in tracks for end in (points[0], points[-1])])
+    bearing = np.arctan2(ends[:, 1], ends[:, 0])
+    apart = np.abs(paths.wrap(bearing[:, None] - angle))  # (2T, K)
+    on_arm = (apart <= np.radians(15.0)) & (apart == apart.min(1, keepdims=True))
+    return (on_arm & (np.linalg.norm(ends, axis=1) >= 25.0)[:, None]).sum(0) >= 2
 
 
 def names(data_root: str = junction.DATA_ROOT) -> list[str]:

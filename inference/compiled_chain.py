@@ -139,8 +139,8 @@ class CompiledChains:
         return self.kernel.unpack(row[:-1]), float(row[-1])
 
     def polish(self) -> None:
-        """Climb from the best state. Raises InputError where the kernel has no edits or refit."""
+        """Climb from the best state of every chain. Raises InputError where the kernel has no edits or refit."""
         if self.kernel.refit is None:
             raise InputError("polish=true needs a kernel with edits and a refit, but this model's has none")
-        row = int(self.tops[:, -1].argmax())
-        self.tops[row, :-1], self.tops[row, -1] = polish(self.kernel, self.tops[row, :-1])
+        for row in self.tops:
+            row[:-1], row[-1] = polish(self.kernel, row[:-1])

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from models.capability import Kernel, kernel_types
 
 REFITS = 12  # Gauss-Newton steps after an edit, at most
-PATIENCE = 3  # refits after which an edit must be close to the best
-SWEEPS = 6  # at most
-HOPELESS = 400.0  # nats below the best after the first refit: give the edit up
+PATIENCE = 2  # refits after which an edit must be close to the best
+SWEEPS = 6  # rounds over all edits, at most
+HOPELESS = 100.0  # nats below the best after the first refit: give the edit up
 CLOSE = 25.0  # nats
 SETTLED = 0.02  # nats gained by a refit
-WORTH = 0.5  # nats that make another sweep worthwhile
+WORTH = 0.5  # nats that make another round worthwhile
 
 
 def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, score):  # type: ignore[no-untyped-def]
@@ -28,13 +28,9 @@ def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, sco
     evaluate(z, floats, ints, cache, out)
     commit(cache)
     score[0] = out[0] + out[1]
-    for _ in range(SWEEPS):
-        before = score[0]
-        for index in range(-1, num_edits):
-            if index < 0:
-                trial[:] = z
-            elif not edit(index, z, floats, trial):
-                continue
+    index, idle = -1, 0  # first refit the state itself, then go round the edits until none of them helps
+    for _ in range(SWEEPS * num_edits):
+        if index < 0 or edit(index, z, floats, trial):
             top = -np.inf
             for step in range(REFITS + 1):
                 evaluate(trial, floats, ints, cache, out)
@@ -47,11 +43,13 @@ def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, sco
                 if step >= PATIENCE and (top < score[0] - CLOSE or gain < SETTLED):
                     break
                 refit(trial, floats, ints, cache)
+            idle = 0 if top > score[0] + WORTH and index >= 0 else idle
             if top > score[0] + 1e-6:
                 score[0], z[:] = top, best
                 evaluate(z, floats, ints, cache, out)
                 commit(cache)
-        if score[0] < before + WORTH:
+        index, idle = (index + 1) % num_edits, idle + 1
+        if idle > num_edits:
             break
 
 

@@ -196,7 +196,7 @@ def run(
                  the model's data-driven start
     thin         keep every thin-th state after the warm-up; warmup = num_steps keeps the last state
     resample     resample chains between themselves while they anneal
-    polish       climb greedily from the best state over edits of the structure (the estimate, not the draws)
+    polish       climb greedily from the best state of every chain over edits of the structure; the draws stay
     num_workers  threads of the compiled path; the draws do not depend on it
 
     Raises InputError where the model lacks moves, a start or a kernel that is asked for."""

@@ -41,11 +41,11 @@ from models.intersection.moments import (
 
 EXACT, HALF, POINT = 0, 1, 2
 LIKELIHOODS = {"exact": EXACT, "half": HALF, "point": POINT}
-NEGLIGIBLE = 37.0  # exp(-37) is below the resolution of a double next to 1
+NEGLIGIBLE = 25.0  # an arm with less than exp(-25) of the best one's weight is left out of the sum
 FAR_LANE = 18.0  # a lane with less than exp(-18) of the closest one's weight is left out of the sum
 NO_LANE = 1e18  # cost where an arm has no lane of the driving direction
 LOG_FACTORIAL = np.array([math.lgamma(n + 1.0) for n in range(256)])
-FAST = {"reassoc", "contract", "arcp", "nsz"}
+FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -91,7 +91,7 @@ def mean_row(coef, first, last, side, cx, cy, arm, scatter, row):  # type: ignor
 def sum_lanes_row(coef, first, last, width, num, stray, row):  # type: ignore[no-untyped-def]
     """Turn the cost of the closest of `num` lanes into -log sum over the lanes of exp(-cost).
 
-    Halves that are far better off as stray ones are left alone: what they add is below resolution."""
+    Halves that are far better off as stray ones are left alone: they add nothing that counts."""
     top = num - 1.0
     for h in range(first, last):
         if row[0, h] > stray[h] + 3.0 * NEGLIGIBLE:
@@ -109,7 +109,10 @@ def sum_lanes_row(coef, first, last, width, num, stray, row):  # type: ignore[no
                 if more > FAR_LANE:
                     break
                 extra += math.exp(-more)
-        row[0, h] -= math.log1p(extra)
+        if extra < 1e-3:  # log(1 + extra), to 1e-13
+            row[0, h] -= extra * (1.0 - extra * (0.5 - extra / 3.0))
+        else:
+            row[0, h] -= math.log1p(extra)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -120,9 +123,10 @@ def two_lowest(rows, pick, num_arms, low, second):  # type: ignore[no-untyped-de
     for a in range(num_arms):
         row = rows[int(pick[a]), a, 0]
         for h in range(len(low)):
-            above = max(low[h], row[h])
-            low[h] = min(low[h], row[h])
-            second[h] = min(second[h], above)
+            value, least = row[h], low[h]
+            above = value if value > least else least
+            low[h] = value if value < least else least
+            second[h] = above if above < second[h] else second[h]
 
 
 @nb.njit(cache=True, error_model="numpy")

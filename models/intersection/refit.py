@@ -79,7 +79,7 @@ def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
         if floats[WIDTH_SPREAD] == 0.0 or z[side] * z_new[side] < 0.5:
             return False
         z_new[o + WIDTH] *= z[side] / z_new[side]
-    if floats[SHIFT_STD] > 0.0:
+    if abs(axis) < 2.0 * floats[SHIFT_STD]:
         z_new[o + SHIFT] += axis
     else:
         z_new[o + ANGLE] = unwrap_step(z[o + ANGLE] + axis / LEVER)
@@ -88,18 +88,18 @@ def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def add_square(hessian, gradient, where, slopes, residual, weight):  # type: ignore[no-untyped-def]
-    """Add weight / 2 residual^2 to the quadratic model; `where` the unknowns that the residual depends on."""
+    """Add weight / 2 residual^2 to the quadratic model, lower triangle; `where` the unknowns, in rising order."""
     for i in range(len(where)):
-        gradient[where[i]] += weight * residual * slopes[i]
-        for j in range(len(where)):
-            hessian[where[i], where[j]] += weight * slopes[i] * slopes[j]
+        pull = weight * slopes[i]
+        gradient[where[i]] += residual * pull
+        for j in range(i + 1):
+            hessian[where[i], where[j]] += pull * slopes[j]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def add_half(coef, h, side, lane, z, arm, hessian, gradient, where, slopes):  # type: ignore[no-untyped-def]
-    """Add the cost of one half track on one lane."""
+def add_half(coef, h, side, lane, z, arm, dx, dy, hessian, gradient, where, slopes):  # type: ignore[no-untyped-def]
+    """Add the cost of one half track on one lane of an arm with direction (dx, dy)."""
     o = HEAD + arm * ARM
-    dx, dy = math.cos(z[o + ANGLE]), math.sin(z[o + ANGLE])
     bend = z[o + BEND]
     rx, ry = coef[mo.X, h] - z[1], coef[mo.Y, h] - z[2]
     across, along = -dy * rx + dx * ry, dx * rx + dy * ry
@@ -127,7 +127,6 @@ def add_half(coef, h, side, lane, z, arm, hessian, gradient, where, slopes):  # 
     curve = 2 * (dx * dx - dy * dy) * (coef[mo.A_YY, h] - coef[mo.A_XX, h]) - 4 * dx * dy * coef[mo.A_XY, h]
     curve -= dx * coef[mo.A_X, h] + dy * coef[mo.A_Y, h]
     hessian[a, a] += max(curve, 0.0)
-    hessian[a, b] += twist
     hessian[b, a] += twist
     hessian[b, b] += 2 * coef[mo.A_KK, h]
 
@@ -179,9 +178,13 @@ def solve_spd(matrix, vector, n):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def quadratic_model(z, coef, entries, stray, rows, pick, floats, hessian, gradient):  # type: ignore[no-untyped-def]
-    """Hessian and gradient of -log p at z, halves on their closest lanes; stray halves say nothing."""
+    """Hessian (lower triangle) and gradient of -log p at z, halves on their closest lanes; stray halves say nothing."""
     num = int(z[0])
     where, slopes = np.zeros(7, np.int64), np.zeros(7)
+    directions = np.empty((num, 2))
+    for a in range(num):
+        angle = z[HEAD + a * ARM + ANGLE]
+        directions[a, 0], directions[a, 1] = math.cos(angle), math.sin(angle)
     hessian[:] = 0.0
     gradient[:] = 0.0
     for h in range(coef.shape[1]):
@@ -190,8 +193,9 @@ def quadratic_model(z, coef, entries, stray, rows, pick, floats, hessian, gradie
             if rows[int(pick[a]), a, 0, h] < low:
                 low, arm = rows[int(pick[a]), a, 0, h], a
         if low < NO_LANE and low < stray[h]:
-            side = 1.0 if h < entries else -1.0
-            add_half(coef, h, side, rows[int(pick[arm]), arm, 1, h], z, arm, hessian, gradient, where, slopes)
+            side, lane = 1.0 if h < entries else -1.0, rows[int(pick[arm]), arm, 1, h]
+            dx, dy = directions[arm, 0], directions[arm, 1]
+            add_half(coef, h, side, lane, z, arm, dx, dy, hessian, gradient, where, slopes)
     add_prior(z, floats, hessian, gradient)
 
 

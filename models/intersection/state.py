@@ -57,7 +57,7 @@ class Junction:
     width: float = 3.0  # median lane width [m]
     width_spread: float = 0.15  # of its logarithm; 0 fixes it
     bend_std: float = 0.003  # curvature of an arm [1/m]; 0: straight arms
-    shift_std: float = 0.3  # of an arm beside the centre [m]; 0: all meet in it
+    shift_std: float = 0.0  # of an arm beside the centre [m]; 0: all meet in it
     position_std: float = 1.0  # of a point across its lane [m]
     along_std: float = 3.0  # of a point along its lane [m]
     offset_std: float = 0.3  # of a whole half track across its lane [m]

@@ -50,23 +50,26 @@ def select(only: list[str]) -> list[fig.Measurement]:
     return [m for m in every if not only or any(f.key in only for f in m.figures)]
 
 
-def measure(chosen: list[fig.Measurement], effort: Effort) -> tuple[list[fig.Figure], fig.Values]:
-    """Figures and their values, the yardstick taken before and after."""
+def measure(chosen: list[fig.Measurement], effort: Effort) -> tuple[list[fig.Figure], fig.Values, int]:
+    """Figures, their values, and how many measurements failed; the yardstick is taken before and after."""
     readings = reference_loop_ns()
     values: fig.Values = {}
+    failed = 0
     for measurement in chosen:
         try:
             values |= measurement.measure(effort)
         except Exception as error:  # what is measured already must not be lost
             traceback.print_exc()
+            failed += 1
             values |= {f.key: fig.Value(None, f"failed: {error}") for f in measurement.figures}
     readings += reference_loop_ns()
     yardstick = fig.Value(median(readings), f"{min(readings):.2f} to {max(readings):.2f}: far apart on a busy machine")
-    return [REFERENCE, *(f for m in chosen for f in m.figures)], {REFERENCE.key: yardstick} | values
+    return [REFERENCE, *(f for m in chosen for f in m.figures)], {REFERENCE.key: yardstick} | values, failed
 
 
 def main(words: list[str] | None = None, effort: Effort | None = None) -> int:
-    """The command; `effort` replaces both --quick and the full one. Returns the exit code."""
+    """The command; `effort` replaces both --quick and the full one. Returns the exit code:
+    0, 1 where a measurement failed, 2 for a wrong word."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.intersection", description="Figures against [M20].")
     parser.add_argument("--quick", action="store_true", help="100 scenes instead of 1000")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
@@ -83,13 +86,13 @@ def main(words: list[str] | None = None, effort: Effort | None = None) -> int:
         return 2
     effort = effort or (QUICK if options.quick else FULL)._replace(show=sys.stderr.isatty())
     began = time.perf_counter()
-    figures, values = measure(chosen, effort)
+    figures, values, failed = measure(chosen, effort)
     run = fig.machine() | {"scenes": effort.scenes, "seconds": round(time.perf_counter() - began)}
     if options.json:
         print(fig.as_json(figures, values, run))
     else:
         fig.print_table("Intersections against [M20]", figures, values, run)
-    return 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks import intersection, junction_structure
-from benchmarks.figure import Figure, Value, share
+from benchmarks.figure import Figure, Measurement, Value, Values, share
 from benchmarks.junction import Effort, m20
 from benchmarks.timing import THREADS
 from experiments.scenarios.protocol import protocol
@@ -60,7 +60,9 @@ def test_json_is_one_object_with_the_figures_asked_for(capsys: pytest.CaptureFix
 
 def test_the_table_shows_value_target_and_paper(capsys: pytest.CaptureFixture[str]) -> None:
     assert intersection.main(["--only", "us_per_sample"], effort=TINY) == 0
-    row = next(line for line in capsys.readouterr().out.splitlines() if "us_per_sample " in line)
+    row = next(
+        line for line in capsys.readouterr().out.splitlines() if "us_per_sample " in line
+    )  # the row's first line
     assert "<= 2.5" in row and "9.8" in row and ("ok" in row or "miss" in row)
 
 
@@ -68,6 +70,24 @@ def test_an_unknown_figure_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert intersection.main(["--only", "us_per_smaple"], effort=TINY) == 2
     error = capsys.readouterr().err
     assert "us_per_smaple" in error and "us_per_sample" in error
+
+
+def test_a_failing_measurement_loses_no_other(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(effort: Effort) -> Values:
+        raise RuntimeError("no such luck")
+
+    figures = [Figure(key, "", "made up for this test") for key in ("lost", "kept")]
+    made_up = (
+        Measurement(tuple(figures[:1]), broken),
+        Measurement(tuple(figures[1:]), lambda effort: {"kept": Value(1.0)}),
+    )
+    monkeypatch.setattr(intersection, "measurements", lambda: made_up)
+    assert intersection.main(["--json"], effort=TINY) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["kept"] == 1.0 and found["lost"] is None
+    assert found["definitions"]["lost"]["detail"] == "failed: no such luck"
 
 
 def test_real_junctions_are_skipped_with_a_reason_where_there_are_none(

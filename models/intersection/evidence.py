@@ -70,8 +70,9 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
     begin, end, entries = hv.outer_halves(path, turn, offsets, origin, model.inner_radius, MIN_POINTS)
     if len(begin) == 0:
         raise InputError(
-            f"none of the {len(offsets) - 1} tracks has {MIN_POINTS} points outside {model.inner_radius:g} m and "
-            f"one inside of where they meet ({origin[0]:.1f}, {origin[1]:.1f}); give tracks that cross the junction"
+            f"none of the {len(offsets) - 1} tracks comes within {hv.CROSSES:g} m of where they meet, "
+            f"({origin[0]:.1f}, {origin[1]:.1f}), and has {MIN_POINTS} points on a straight part farther than "
+            f"{hv.LEAST_RADIUS:g} m from it; give tracks that cross the junction"
         )
     observed, s, starts = hv.gather_halves(points, path, phi, begin, end, entries, origin)
     whole = Tracks(points - origin, phi, offsets) if model.likelihood != "exact" else None

@@ -12,6 +12,7 @@ END = 24  # points at a track's end that show an arm's direction
 TURN = 0.25  # change of direction that ends an arm [rad]
 MARGIN = 4  # points left out before a turn
 ENOUGH = 30.0  # [m] of a half track
+CROSSES = 40.0  # [m] from the crossing: a track that stays farther away is none of its vehicles
 LEAST_RADIUS = 12.0  # [m] inside which no point is on an arm
 
 
@@ -135,15 +136,15 @@ def outer_halves(path, turn, offsets, centre, inner_radius, min_points):  # type
 
     The entry half ends where the track first comes inside inner_radius or begins to turn, the exit half begins where
     it leaves it last or has turned; a half that does not reach out far enough to leave ENOUGH metres comes closer. A
-    track that never comes within inner_radius does not cross."""
+    track that stays CROSSES metres away does not cross."""
     num = len(offsets) - 1
     begin, end = np.zeros(2 * num, np.int64), np.zeros(2 * num, np.int64)
-    radius2, count, entries = inner_radius * inner_radius, 0, 0
+    count, entries = 0, 0
     for side in range(2):
         for t in range(num):
             first, last = offsets[t], offsets[t + 1]
             k = closest_index(path, first, last, centre[0], centre[1])
-            if (path[k, 0] - centre[0]) ** 2 + (path[k, 1] - centre[1]) ** 2 > radius2:
+            if (path[k, 0] - centre[0]) ** 2 + (path[k, 1] - centre[1]) ** 2 > CROSSES * CROSSES:
                 continue
             step, outer = (-1, first) if side == 0 else (1, last - 1)
             reach = math.hypot(path[outer, 0] - centre[0], path[outer, 1] - centre[1])

@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from inference.calibration import predict
 from models.intersection.evidence import JunctionEvidence
 from models.intersection.state import Junction
 from models.program import Latents, simulate
+
+# The tests' own settings, whatever the defaults are: every latent that an arm can have, and [M20]'s straight arms.
+SETTINGS: dict[str, Any] = {
+    "max_lanes": 6,
+    "one_way": True,
+    "gap_max": 8.0,
+    "centre_std": 10.0,
+    "width": 3.0,
+    "width_spread": 0.15,
+    "bend_std": 0.003,
+    "shift_std": 0.3,
+    "position_std": 1.0,
+    "along_std": 3.0,
+    "offset_std": 0.3,
+    "phase_std": 20.0,
+    "heading_std": 0.3,
+    "clutter": 0.02,
+    "clutter_radius": 60.0,
+}
+NO_BENDS: dict[str, Any] = SETTINGS | {"width_spread": 0.0, "bend_std": 0.0, "shift_std": 0.0}
+FULL = Junction(**SETTINGS)
 
 
 def blank_evidence(

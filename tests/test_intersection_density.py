@@ -22,10 +22,10 @@ from models.intersection.moments import CHORD
 from models.intersection.state import Junction
 from models.intersection.tracks import Tracks
 from models.program import Latents, log_joint, terms
-from tests.small_junction import blank_evidence, one, states, with_points
+from tests.small_junction import FULL, blank_evidence, one, states, with_points
 
 Array = NDArray[np.float64]
-MODEL = Junction(clutter_radius=80.0)
+MODEL = replace(FULL, clutter_radius=80.0)
 STRAIGHT = replace(MODEL, bend_std=0.0, shift_std=0.0, width_spread=0.0)
 
 

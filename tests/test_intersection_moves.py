@@ -15,13 +15,13 @@ from models.intersection.packing import MAX_ARMS, MIN_ARMS
 from models.intersection.state import Junction
 from models.program import Latents, quiet_doubles, terms, total
 from tests.involution import assert_involution, uniforms
-from tests.small_junction import blank_evidence, states
+from tests.small_junction import FULL, NO_BENDS, blank_evidence, states
 
 MODELS = {
-    "extended": Junction(),
-    "extended, straight": Junction(bend_std=0.0, shift_std=0.0, width_spread=0.0),
-    "m20": Junction(steps="m20", bend_std=0.0, shift_std=0.0, width_spread=0.0, width=2.7),
-    "m20, all latents, two-way": Junction(steps="m20", one_way=False, max_lanes=3),
+    "extended": FULL,
+    "extended, straight": Junction(**NO_BENDS),
+    "m20": Junction(**NO_BENDS, steps="m20"),
+    "m20, all latents, two-way": replace(FULL, steps="m20", one_way=False, max_lanes=3),
 }
 MOVES = [(name, move) for name, model in MODELS.items() for move in model.moves()]
 IDS = [f"{name}: {move.name}" for name, move in MOVES]
@@ -192,8 +192,7 @@ def test_the_move_check_notices_a_missing_term() -> None:
 
 def test_toggles_keep_the_other_lanes_in_place() -> None:
     """With the axis moved by its shift: outer lanes stay within the little steps of gap (0.3 m) and angle."""
-    model = replace(MODELS["extended"], one_way=True)
-    move = next(move for move in model.moves() if move.name == "toggle")
+    move = next(move for move in FULL.moves() if move.name == "toggle")
     z, u = STATES["extended"], uniforms(move, 600, seed=4)
     u[:, 3], u[:, 4], u[:, 5] = 0.5, 0.1, 0.5  # no little steps, by shift
     with quiet_doubles():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -24,15 +24,14 @@ from models.intersection.angles import MIN_SEPARATION, HardCoreAngles
 from models.intersection.packing import MAX_ARMS, MIN_ARMS
 from models.intersection.state import Junction
 from models.program import Latents, quiet_doubles
-from tests.small_junction import blank_evidence, states
+from tests.small_junction import FULL, NO_BENDS, SETTINGS, blank_evidence, states
 
 Array = NDArray[Any]
 NOTHING = blank_evidence(0, 0)._replace(points=torch.zeros(3, 0, dtype=torch.float64))  # no half track at all
-STRAIGHT = {"bend_std": 0.0, "shift_std": 0.0, "width_spread": 0.0}  # the arms of [M20]
 MODELS = {
-    "extended": Junction(),
-    "m20": Junction(steps="m20", **STRAIGHT),
-    "m20, two-way": Junction(steps="m20", one_way=False, **STRAIGHT),
+    "extended": FULL,
+    "m20": Junction(**NO_BENDS, steps="m20"),
+    "m20, two-way": replace(Junction(**NO_BENDS, steps="m20"), one_way=False),
 }
 
 
@@ -62,15 +61,15 @@ def functionals(z: dict[str, Any]) -> dict[str, Array]:
 
 
 @cache
-def prior_values(one_way: bool, straight: bool) -> dict[str, Array]:
+def prior_values(model: Junction) -> dict[str, Array]:
     """Functionals of 1e5 prior draws."""
-    model = replace(Junction(**STRAIGHT) if straight else Junction(), one_way=one_way)
     return functionals(states(model, 100_000, seed=99, evidence=NOTHING))
 
 
 def z_scores(model: Junction, chains: dict[str, Array]) -> dict[str, float]:
     """{functional: z} of independent means (C,) against 1e5 draws of the prior; K against its uniform prior."""
-    reference = prior_values(model.one_way, model.bend_std == 0)
+    same = {field.name: getattr(model, field.name) for field in fields(Junction)}  # of a subclass, without its moves
+    reference = prior_values(Junction(**same))
     scores = {}
     for name, means in chains.items():
         exact = name.startswith("P(K")
@@ -129,14 +128,14 @@ class Alone(Junction):
         return (move._replace(probability=1.0, propose=propose),)
 
 
-@pytest.mark.parametrize("kind", [move.name for move in Junction().moves()])
+@pytest.mark.parametrize("kind", [move.name for move in FULL.moves()])
 def test_each_move_alone_leaves_the_prior_as_it_is(kind: str) -> None:
-    scores = batched_scores(Alone(kind=kind))
+    scores = batched_scores(Alone(kind=kind, **SETTINGS))
     assert max(map(abs, scores.values())) < 4.0, scores
 
 
 def test_batched_chains_return_the_prior() -> None:
-    scores = batched_scores(Junction(), num_steps=100)
+    scores = batched_scores(FULL, num_steps=100)
     assert max(map(abs, scores.values())) < 4.0, scores
 
 
@@ -188,7 +187,7 @@ MUTATIONS: dict[str, tuple[str, Change, str]] = {  # the move, what is forgotten
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_prior_notices_a_forgotten(name: str) -> None:
     kind, change, witness = MUTATIONS[name]
-    arms = STRAIGHT if kind == "arms" else {}  # with bends log p of a slot is near zero by chance
+    arms = NO_BENDS if kind == "arms" else SETTINGS  # with bends log p of a slot is near zero by chance
     scores = batched_scores(Alone(kind=kind, change=change, **arms), num_steps=120)
     assert abs(scores[witness]) > 6.0, scores
 
@@ -202,7 +201,7 @@ def test_prior_notices_a_forgotten_normaliser_of_the_hard_core(monkeypatch: pyte
         return whole(self, value) + (count - 1) * torch.log1p(-count * MIN_SEPARATION / (2 * math.pi))
 
     monkeypatch.setattr(HardCoreAngles, "log_prob", bare)
-    scores = batched_scores(Alone(kind="arms"))
+    scores = batched_scores(Alone(kind="arms", **SETTINGS))
     assert scores["P(K = 2)"] > 6.0 and scores["P(K = 7)"] < -6.0, scores
 
 

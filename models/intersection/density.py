@@ -199,6 +199,9 @@ def closest_points(points, begin, end, first, last, side, cx, cy, arms, num_arms
         return -math.inf
     counts[:] = 0.0
     votes = counts.copy()
+    turns = np.empty((2, num_arms))
+    for a in range(num_arms):
+        turns[0, a], turns[1, a] = math.cos(arms[a, 0]), math.sin(arms[a, 0])
     total = 0.0
     for h in range(first, last):
         votes[:] = 0.0
@@ -209,7 +212,7 @@ def closest_points(points, begin, end, first, last, side, cx, cy, arms, num_arms
                 if num < 0.5:
                     continue
                 angle, gap, width = arms[a, 0], arms[a, 1], arms[a, 4]
-                across = -math.sin(angle) * (points[0, i] - cx) + math.cos(angle) * (points[1, i] - cy) - arms[a, 6]
+                across = turns[0, a] * (points[1, i] - cy) - turns[1, a] * (points[0, i] - cx) - arms[a, 6]
                 e = side * across - 0.5 * gap - 0.5 * width
                 k = min(max(math.floor(e / width + 0.5), 0.0), num - 1.0)
                 r = (e - k * width) / noise[0]

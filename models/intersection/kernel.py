@@ -22,7 +22,7 @@ from models.intersection.density import EXACT, HALF, LIKELIHOODS, POINT
 from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
 from models.intersection.halves import smooth
 from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS
-from models.intersection.packing import ARM, ENTRIES, EXITS, HEAD, MAX_ARMS, SIZE, pack, unpack
+from models.intersection.packing import ARM, ENTRIES, HEAD, MAX_ARMS, SIZE, pack, unpack
 from models.intersection.prior import GAP_MAX, log_prior, prior_numbers
 from models.intersection.refit import EDITS_PER_ARM, FREE, edit, quadratic_model, solve_spd, take_step
 from models.intersection.split import (
@@ -81,6 +81,12 @@ def memory(cache, halves):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
+def side_range(side, entries, halves):  # type: ignore[no-untyped-def]
+    """First and last half of the entries (side 0) or the exits (side 1)."""
+    return (0, entries) if side == 0 else (entries, halves)
+
+
+@nb.njit(cache=True)
 def lanes_of(z, field):  # type: ignore[no-untyped-def]
     total = 0.0
     for a in range(int(z[0])):
@@ -120,12 +126,14 @@ def point_score(z, floats, ints, counts):  # type: ignore[no-untyped-def]
     half_ranges(table, offsets, cell_of(z[1], z[2]), ints[MARGIN], begin, end)
     points = floats[FLOATS : FLOATS + 3 * offsets[tracks]].reshape((3, offsets[tracks]))
     arms = z[HEAD:].reshape((MAX_ARMS, ARM))
-    noise, num = floats[POSITION : HEADING + 1], int(z[0])
-    entries, exits = lanes_of(z, ENTRIES), lanes_of(z, EXITS)
-    score = density.closest_points(points, begin, end, 0, tracks, 1.0, z[1], z[2], arms, num, entries, noise, counts)
-    return score + density.closest_points(
-        points, begin, end, tracks, halves, -1.0, z[1], z[2], arms, num, exits, noise, counts
-    )
+    noise, num, score = floats[POSITION : HEADING + 1], int(z[0]), 0.0
+    for side in range(2):
+        first, last = side_range(side, tracks, halves)
+        sign, lanes = 1.0 - 2.0 * side, lanes_of(z, ENTRIES + side)
+        score += density.closest_points(
+            points, begin, end, first, last, sign, z[1], z[2], arms, num, lanes, noise, counts
+        )
+    return score
 
 
 @nb.njit(cache=True)
@@ -160,8 +168,9 @@ def update_arms(z, coef, stray, cell, entries, which, keys, turns, scatter, rows
                 turn = 1 - turn
                 turns[turn, a, 0], turns[turn, a, 1], turns[turn, a, 2] = arm[0], arm[5], cell
                 density.scatter_row(coef, arm[0], arm[5], scatter[turn, a])
-            fill_side(coef, 0, entries, 1.0, z, arm, stray, scatter[turn, a], rows[row, a])
-            fill_side(coef, entries, coef.shape[1], -1.0, z, arm, stray, scatter[turn, a], rows[row, a])
+            for side in range(2):
+                first, last = side_range(side, entries, coef.shape[1])
+                fill_side(coef, first, last, 1.0 - 2.0 * side, z, arm, stray, scatter[turn, a], rows[row, a])
         which[1, a], which[3, a] = row, turn
 
 
@@ -184,17 +193,18 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
         coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
         stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
     update_arms(z, coef, stray, cell + 1.0, entries, which, keys, turns, scatter, rows)
-    pick, in_lanes, out_lanes = which[1], lanes_of(z, ENTRIES), lanes_of(z, EXITS)
-    if kind == HALF:
-        out[1] = density.closest_arms(rows, pick, num, 0, entries, in_lanes, counts)
-        out[1] += density.closest_arms(rows, pick, num, entries, halves, out_lanes, counts)
-        return
-    low, second = room[:halves], room[halves : 2 * halves]
-    density.two_lowest(rows, pick, num, low, second)
-    share = (floats[LOG_CLUTTER], floats[LOG_KEPT])
+    pick, low, second = which[1], room[:halves], room[halves : 2 * halves]
+    if kind == EXACT:
+        density.two_lowest(rows, pick, num, low, second)
     out[1] = floats[CONSTANT]
-    out[1] += density.sum_arms(rows, pick, num, 0, entries, in_lanes, low, second, stray, *share)
-    out[1] += density.sum_arms(rows, pick, num, entries, halves, out_lanes, low, second, stray, *share)
+    for side in range(2):
+        first, last = side_range(side, entries, halves)
+        lanes = lanes_of(z, ENTRIES + side)
+        if kind == EXACT:
+            share = (floats[LOG_CLUTTER], floats[LOG_KEPT])
+            out[1] += density.sum_arms(rows, pick, num, first, last, lanes, low, second, stray, *share)
+        else:
+            out[1] += density.closest_arms(rows, pick, num, first, last, lanes, counts)
 
 
 def refit(z, floats, ints, cache):  # type: ignore[no-untyped-def]

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
 
 from models.intersection.angles import MIN_SEPARATION
 from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, MAX_ARMS, MIN_ARMS, SHIFT, WIDTH
@@ -42,12 +43,11 @@ NUM_UNIFORMS = 10
 SMALL_STEPS = NUM_PRIOR  # position in the kernel's floats: 1 mixes in small steps
 NUM_SETTINGS = NUM_PRIOR + 1
 
-MAX_ROTATION = math.radians(6.0)
 MAX_CENTRE = 6.0  # [m]
-MAX_GAP = 1.8  # [m]
 MAX_LOG_WIDTH = 0.15
-MAX_BEND = 0.004  # [1/m]
-MAX_SHIFT = 1.0  # [m]
+# fields that walk by themselves, by kind, and their longest steps: 6 degrees, 1.8 m, 0.004 / m, 1 m
+WALK_FIELD = np.array([ANGLE, 0, GAP, 0, 0, 0, 0, BEND, SHIFT])
+WALK_SIZE = np.array([math.radians(6.0), 0.0, 1.8, 0.0, 0.0, 0.0, 0.0, 0.004, 1.0])
 LEVER = 38.0  # [m] mean distance of the points from the centre: turns a lateral step into a rotation
 
 
@@ -99,9 +99,9 @@ def normal_quantile_low(u):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
-def insertion_sort(values, num):  # type: ignore[no-untyped-def]
-    """Sort the first `num` values in place; for a handful, and quick to compile."""
-    for i in range(1, num):
+def insertion_sort(values):  # type: ignore[no-untyped-def]
+    """Sort in place; for a handful, and quick to compile."""
+    for i in range(1, len(values)):
         value, j = values[i], i - 1
         while j >= 0 and values[j] > value:
             values[j + 1] = values[j]
@@ -114,7 +114,7 @@ def free_angles(z, num, out):  # type: ignore[no-untyped-def]
     """Angles at least MIN_SEPARATION from all `num` active arms: their measure; `out` the sorted arms."""
     for a in range(num):
         out[a] = z[HEAD + a * ARM + ANGLE]
-    insertion_sort(out, num)
+    insertion_sort(out[:num])
     total = 0.0
     for a in range(num):
         following = out[a + 1] if a < num - 1 else out[0] + 2.0 * math.pi
@@ -319,14 +319,18 @@ def scale_width(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped
 
 
 @nb.njit(cache=True)
-def step_field(field, size, z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
-    """Uniform walk of one field of a uniform arm; returns the arm."""
+def walk_field(kind, z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
+    """Uniform walk of one field of a uniform arm, within what the field may be."""
     arm, _ = split_choice(u[0], int(z[0]))
-    size *= step_scale(u[1], settings)
-    z_new[HEAD + arm * ARM + field] += size * (2.0 * u[2] - 1.0)
+    field, size = WALK_FIELD[kind], WALK_SIZE[kind] * step_scale(u[1], settings)
+    o = HEAD + arm * ARM + field
+    z_new[o] += size * (2.0 * u[2] - 1.0)
     u_new[2] = 1.0 - u[2]
     log_q[0] = log_q[1] = -math.log(int(z[0]) * 2.0 * size)
-    return arm
+    if field == ANGLE:
+        z_new[o] = wrap(z_new[o])
+        return apart(z_new, int(z[0]), z_new[o], arm)
+    return field != GAP or 0.0 <= z_new[o] <= settings[GAP_MAX]
 
 
 @nb.njit(cache=True)
@@ -344,17 +348,9 @@ def propose(kind, z, u, floats, ints, z_new, u_new, log_q):  # type: ignore[no-u
     z_new[:] = z
     u_new[:] = u
     log_q[:] = 0.0
-    if kind == ROTATE:
-        arm = step_field(ANGLE, MAX_ROTATION, z, u, floats, z_new, u_new, log_q)
-        o = HEAD + arm * ARM + ANGLE
-        z_new[o] = wrap(z_new[o])
-        return apart(z_new, int(z[0]), z_new[o], arm)
     if kind == CENTRE:
         shift_centre(z, u, floats, z_new, u_new, log_q)
         return True
-    if kind == CHANGE_GAP:
-        arm = step_field(GAP, MAX_GAP, z, u, floats, z_new, u_new, log_q)
-        return 0.0 <= z_new[HEAD + arm * ARM + GAP] <= floats[GAP_MAX]
     if kind == ARMS:
         return change_arms(z, u, floats, z_new, u_new, log_q)
     if kind == LANES:
@@ -363,11 +359,7 @@ def propose(kind, z, u, floats, ints, z_new, u_new, log_q):  # type: ignore[no-u
         return toggle(z, u, floats, z_new, u_new, log_q)
     if kind == SCALE_WIDTH:
         return scale_width(z, u, floats, z_new, u_new, log_q)
-    if kind == CHANGE_BEND:
-        step_field(BEND, MAX_BEND, z, u, floats, z_new, u_new, log_q)
-        return True
-    step_field(SHIFT, MAX_SHIFT, z, u, floats, z_new, u_new, log_q)
-    return True
+    return walk_field(kind, z, u, floats, z_new, u_new, log_q)
 
 
 def probabilities(steps: str, latent: dict[str, bool]) -> dict[int, float]:

@@ -188,7 +188,7 @@ def quadratic_model(z, coef, entries, stray, rows, pick, floats, hessian, gradie
     hessian[:] = 0.0
     gradient[:] = 0.0
     for h in range(coef.shape[1]):
-        low, arm = NO_LANE, 0
+        low, arm = NO_LANE, num
         for a in range(num):
             if rows[int(pick[a]), a, 0, h] < low:
                 low, arm = rows[int(pick[a]), a, 0, h], a

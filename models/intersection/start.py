@@ -87,7 +87,7 @@ def fill_arms(z, num, mean, directions, entries, width, max_lanes, gap_max, one_
                 z[o + ENTRIES + side] = 0.0 if one_way else 1.0
                 edges[side] = -1.0
                 continue
-            insertion_sort(offsets, count)
+            insertion_sort(offsets[:count])
             edges[side], z[o + ENTRIES + side] = lane_range(offsets[:count], width, max_lanes)
         if z[o + ENTRIES] + z[o + EXITS] < 0.5:
             z[o + ENTRIES] = 1.0

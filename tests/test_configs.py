@@ -40,7 +40,7 @@ def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: s
         keys = {key: 0 for key in target if not key.startswith("_")}
         inspect.signature(function).bind_partial(**keys)  # raises TypeError for a key it does not take
     build(config["model"], "model")
-    build({key: config[key] for key in ("engine", "metrics", "figures")})
+    build({key: config[key] for key in ("engine", "functionals", "metrics", "figures")})
 
 
 def targets_of(node: Any) -> Iterator[dict[str, Any]]:
@@ -68,6 +68,8 @@ def test_a_config_shows_the_defaults_of_the_signature() -> None:
         ("sed=1", "a run has no key 'sed'; did you mean 'seed'?"),
         ("seed=one", "seed: Value 'one' of type 'str' could not be converted to Integer"),
         ("engine=rjmcm", "there is no engine called 'rjmcm'; did you mean 'rjmcmc'?"),
+        ("force=5", "force is a switch, but is 5; give true or false"),
+        ("engine.polish=1", "engine.polish is a switch, but is 1; give true or false"),
         ("models=gaussian", "a run has no key 'models'; did you mean 'model'?"),
     ],
 )
@@ -132,6 +134,12 @@ def test_a_value_outside_its_literal_is_refused(package: str) -> None:
     expand(config)
     with pytest.raises(ConfigError, match=r"model.colour is 'gren'; did you mean 'green'\?"):
         check_values(config)
+
+
+def test_a_number_for_a_switch_is_refused_in_a_file_too() -> None:
+    config = OmegaConf.create({"engine": {"_target_": "inference.rjmcmc.run", "_partial_": True, "polish": 2}})
+    with pytest.raises(ConfigError, match=r"engine.polish is a switch, but is 2"):
+        expand(config)
 
 
 def test_a_missing_value_is_asked_for_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from experiments.scenarios import paths
-from experiments.scenarios.csv_tracks import Recorded, csv, even
+from experiments.scenarios.csv_tracks import Recorded, csv, even, read, write
+from experiments.scenarios.protocol import protocol
 from models.intersection.tracks import Tracks
 from models.program import InputError
 
@@ -28,11 +29,14 @@ def drive_east(vehicle: object, speed: float = 10.0, seconds: float = 6.0, y: fl
     return [f"{vehicle},{t:.1f},{speed * t:.3f},{y}" for t in np.arange(0.0, seconds, 0.1)]
 
 
+NORTH = [f"north,{t:.1f},30,{10 * t:.3f}" for t in np.arange(0.0, 6.0, 0.1)]  # crosses whoever drives east
+
+
 def test_a_table_becomes_tracks_with_a_point_every_metre(tmp_path: Path) -> None:
-    rows = ["vehicle,t,x,y", *drive_east("a", y=1000.0), *drive_east("b", speed=7.0)]
+    rows = ["vehicle,t,x,y", *drive_east("a", y=1000.0), *drive_east("b", speed=7.0), *NORTH]
     scene = csv(table(tmp_path, "\n".join(rows)))
     assert scene.truth is None and scene.data.heading is None
-    assert scene.info["tracks"] == 2
+    assert scene.info["tracks"] == 3
     first = track(scene.data, 0)
     np.testing.assert_allclose(first[:, 0], np.arange(len(first)), atol=1e-6)
     np.testing.assert_allclose(first[:, 1], 1000.0)  # coordinates as given
@@ -40,8 +44,8 @@ def test_a_table_becomes_tracks_with_a_point_every_metre(tmp_path: Path) -> None
 
 def test_columns_in_any_order_recordings_and_compression(tmp_path: Path) -> None:
     lines = ["colour,y,x,t,recording,vehicle,heading"]
-    for recording in ("one", "two"):
-        lines += [f"red,{0.5},{10 * t:.2f},{t:.1f},{recording},7,0.1" for t in np.arange(0.0, 6.0, 0.1)]
+    for recording, place in (("one", "0.5,{:.2f}"), ("two", "{:.2f},0.5")):
+        lines += [f"red,{place.format(10 * t)},{t:.1f},{recording},7,0.1" for t in np.arange(0.0, 6.0, 0.1)]
     path = tmp_path / "tracks.csv.gz"
     path.write_bytes(gzip.compress("\n".join(lines).encode()))
     scene = csv(str(path))
@@ -82,6 +86,7 @@ BAD_TABLES = {
     "duplicate times": (HEADER + "a,0,0,0\na,1,1,0\na,1,2,0\n", r"row 4, vehicle a: t = 1 comes twice"),
     "one point per vehicle": (HEADER + "a,0,0,0\nb,0,5,0\n", r"each of the 2 vehicles has a single point"),
     "none crosses": (HEADER + "".join(f"a,{t},{t},0\n" for t in range(9)), r"the longest of 1 tracks is 8.0 m"),
+    "one road": (HEADER + "".join(f"{v},{t},{40 * t},{3 * v}\n" for v in range(4) for t in range(3)), r"one road"),
     "degrees": (
         HEADER + "".join(f"a,{t},{8.4156 + 1e-5 * t},49.0052\n" for t in range(99)),
         r"row 2: x = 8.4156 and y = 49.0052 .* longitude and latitude",
@@ -103,6 +108,23 @@ def test_a_bad_table_gets_one_sentence_with_file_place_and_remedy(case: str, tmp
     assert "\n" not in str(error.value) and "; " in str(error.value)
 
 
+@pytest.mark.parametrize("heading_std", [None, 0.1])
+def test_written_tracks_are_read_again(tmp_path: Path, heading_std: float | None) -> None:
+    tracks = protocol(0, heading_std=heading_std).data
+    write(tmp_path / "tracks.csv", tracks)
+    vehicles = read(tmp_path / "tracks.csv")
+    np.testing.assert_allclose(np.concatenate([v.points for v in vehicles]), tracks.points, atol=1e-6)
+    np.testing.assert_array_equal(np.cumsum([len(v.points) for v in vehicles]), tracks.offsets[1:])
+    if heading_std:
+        np.testing.assert_allclose(np.concatenate([v.heading for v in vehicles]), tracks.heading, atol=1e-6)
+
+
+def test_no_junction_of_the_protocol_is_taken_for_one_road(tmp_path: Path) -> None:
+    for seed in range(20):  # seed 3 has three arms, two of them 28 degrees apart
+        write(tmp_path / "tracks.csv", protocol(seed, tracks=1).data)
+        csv(str(tmp_path / "tracks.csv"))
+
+
 def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"absent\.csv: no such file"):
         csv(str(tmp_path / "absent.csv"))
@@ -113,6 +135,6 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_short_track_among_long_ones_is_left_out(tmp_path: Path) -> None:
-    rows = ["vehicle,t,x,y", *drive_east("a"), *drive_east("b", seconds=1.0), "c,0,3,3"]
+    rows = ["vehicle,t,x,y", *drive_east("a"), *drive_east("b", seconds=1.0), "c,0,3,3", *NORTH]
     scene = csv(table(tmp_path, "\n".join(rows)))
-    assert scene.info["vehicles"] == 3 and scene.info["tracks"] == 1
+    assert scene.info["vehicles"] == 4 and scene.info["tracks"] == 2

@@ -10,7 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 
 from experiments.junction_figures import figures
-from experiments.junction_metrics import match, metrics, structure
+from experiments.junction_lanes import count_probabilities
+from experiments.junction_lanes import figures as lane_figures
+from experiments.junction_metrics import label_free, match, metrics, structure
 from experiments.scenarios.protocol import protocol
 from experiments.scenarios.scene import JunctionTruth, Scene
 from inference.posterior import Posterior, Snapshots
@@ -107,6 +109,35 @@ def posterior_of(scene: Scene) -> Posterior:
     )
 
 
+def test_an_arm_that_nobody_drove_is_not_scored(scene: Scene) -> None:
+    truth = scene.truth._replace(driven=np.arange(len(scene.truth.angle)) > 0)
+    estimate = perfect(scene.truth)
+    found_too = structure(changed(estimate, "entries", 0, 1), truth)  # its counts are nobody's business
+    without = {n: v if v.shape != (SLOTS,) else np.roll(v, -1) for n, v in estimate.items()}
+    missed = structure(without | {"num_arms": estimate["num_arms"] - 1}, truth)
+    for score in (found_too, missed):
+        assert score["structure_right"] == score["lanes_right"] == 1.0
+    assert structure(changed(estimate, "entries", 1, 1), truth)["structure_right"] == 0.0
+
+
+def test_label_free_scalars_ignore_order_and_inactive_slots(scene: Scene) -> None:
+    posterior = posterior_of(scene)
+    scalars = label_free(posterior)
+    lanes = scene.truth.exits.sum()
+    missing = scene.truth.exits[-1]  # of the arm the last draw leaves out
+    assert scalars["num_exits"].tolist() == [[lanes, lanes, lanes + 1, lanes - missing]]
+    assert scalars["centre_x"].shape == (1, 4)
+
+
+def test_lane_count_probabilities_follow_the_weights(scene: Scene) -> None:
+    """Exits of arm 0 are one more in a draw of weight .2; the last arm is missing in one of weight .1."""
+    posterior = posterior_of(scene)
+    shares = count_probabilities(posterior, "exits")
+    right = int(scene.truth.exits[0])
+    assert shares[0, right] == pytest.approx(0.8) and shares[0, right + 1] == pytest.approx(0.2)
+    assert shares[-1].sum() == pytest.approx(0.9)
+
+
 def test_probabilities_of_the_truth_follow_the_weights(scene: Scene) -> None:
     score = metrics(posterior_of(scene), scene)
     assert score["arm_count_probability"] == pytest.approx(0.9)
@@ -121,8 +152,8 @@ def test_without_a_truth_there_is_no_score(scene: Scene) -> None:
 @pytest.mark.parametrize("known", [True, False])
 def test_every_picture_draws_with_and_without_truth(scene: Scene, known: bool) -> None:
     shown = scene if known else scene._replace(truth=None)
-    drawn = figures(posterior_of(scene), shown)
-    assert set(drawn) == {"junction", "arm_count", "anytime"}
+    drawn = figures(posterior_of(scene), shown) | lane_figures(posterior_of(scene), shown)
+    assert set(drawn) == {"junction", "arm_count", "anytime", "lane_counts"}
     for figure in drawn.values():
         canvas = FigureCanvasAgg(figure)
         canvas.draw()

@@ -12,6 +12,7 @@ from experiments.metrics import site_error
 from experiments.run import engine_seed, run
 from experiments.scenarios.toys import line, slot_road
 from inference.posterior import Posterior
+from models.intersection.state import Junction
 from models.program import InputError
 from models.toys.gaussian import ConjugateGaussian
 from tests.conftest import Command
@@ -71,6 +72,81 @@ def test_a_failed_job_does_not_stop_the_sweep(launch: Command) -> None:
     assert calls == 4
     launch("-m", *words)  # resumes: only what failed runs again
     assert len(Path("calls.txt").read_text().split()) == calls + 2
+
+
+def test_what_fails_after_the_engine_loses_nothing_else(launch: Command) -> None:
+    Path("fake_scores.py").write_text(FAKE_SCORES)
+    Path("conf/experiment").mkdir()
+    Path("conf/experiment/broken.yaml").write_text(BROKEN)
+    done = launch(*FAKE, "experiment=broken")
+    assert done.returncode == 1
+    for words in ("metric bad_metric", "no score today", "functional bad_functional", "figure late", "Traceback"):
+        assert words in done.stderr, words
+    assert "good" in done.stdout  # the scores are printed as ever
+    (folder,) = Path("runs").iterdir()
+    assert json.loads((folder / "scores.json").read_text()) == {"good_m": 1.0}
+    assert Posterior.load(folder).draws["beta"].shape == (2, 200, 2)
+    assert "beta[0]" in json.loads((folder / "diagnostics.json").read_text())["summary"]
+    assert (folder / "figures" / "fine.png").is_file() and not (folder / "figures" / "late.png").exists()
+    report = (folder / "report.html").read_text()
+    assert "metric bad_metric failed" in report and "no score today" in report
+    failures = json.loads((folder / "manifest.json").read_text())["failures"]
+    assert failures.keys() == {"metric bad_metric", "functional bad_functional", "figure late"}
+    launch(*FAKE, "experiment=broken")  # what failed is not done: it runs again
+    assert len(Path("calls.txt").read_text().split()) == 2
+
+
+FAKE_SCORES = """
+from matplotlib.figure import Figure
+from models.intersection.state import Junction
+from models.program import InputError
+
+def good_metric(posterior, scene):
+    return {"good_m": 1.0}
+
+def bad_metric(posterior, scene):
+    raise InputError("no score today")
+
+def bad_functional(posterior):
+    return {"x": 1 / 0}
+
+def drawings(posterior, scene):
+    fine, late = Figure(), Figure()
+    late.add_subplot().set_title(r"$\\nonsense{$")  # fails only where it is drawn
+    return {"late": late, "fine": fine}
+"""
+BROKEN = """# @package _global_
+functionals: [{_target_: fake_scores.bad_functional, _partial_: true}]
+metrics:
+  - {_target_: fake_scores.bad_metric, _partial_: true}
+  - {_target_: fake_scores.good_metric, _partial_: true}
+figures: [{_target_: fake_scores.drawings, _partial_: true}]
+"""
+
+
+BAD_TABLES = {
+    "vehicle,t,x\n1,0,0\n": "no column y",
+    "vehicle,t,x,y\n1,0,nan,0\n": "x is 'nan', not a number",
+    "vehicle,t,x,y\n1,1,0,0\n1,0,1,0\n": "sort the rows",
+    "vehicle,t,x,y\n1,0,0,0\n1,0,1,0\n": "t = 0 comes twice",
+    "vehicle,t,x,y\n1,0,0,0\n2,0,1,0\n": "single point",
+    "vehicle,t,x,y\n1,0,8.4,49.0\n1,1,8.4001,49.0\n": "degrees of longitude",
+    "vehicle,t,x,y\n1,0,0,0\n1,1,90,0\n2,0,90,4\n2,1,0,4\n": "along one road",
+}
+
+
+@pytest.mark.parametrize(("text", "words"), BAD_TABLES.items())
+def test_bad_tracks_are_one_sentence_and_leave_nothing(launch: Command, text: str, words: str) -> None:
+    Path("tracks.csv").write_text(text)
+    done = launch("experiment=my_tracks", "scenario.path=tracks.csv")
+    assert done.returncode == 2, done.stderr
+    assert words in done.stderr and done.stderr.count("\n") == 1
+    assert not list(Path("runs").iterdir())
+
+
+def test_a_model_that_prepares_names_the_data_it_reads() -> None:
+    with pytest.raises(InputError, match="Junction reads Tracks, but the scenario gives Readings"):
+        run(line, Junction(), lambda *_, seed: None)  # type: ignore[arg-type,return-value]
 
 
 def test_any_other_error_shows_its_traceback_and_the_run_it_belongs_to(launch: Command) -> None:

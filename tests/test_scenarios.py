@@ -263,6 +263,7 @@ def test_recorded_traffic_keeps_to_the_lanes_of_its_map() -> None:
         for i, (a, b) in enumerate(zip(scene.data.offsets[:-1], scene.data.offsets[1:], strict=True))
     ]
     assert np.quantile(np.abs(np.concatenate(turn)), 0.95) < 0.1
+    assert scene.truth.driven.tolist() == [True, True, False, True]  # one side street is empty in the recording
     assert traffic("lankershim_2", headings=False).data.heading is None
 
 

@@ -20,6 +20,13 @@ def test_a_folder_appears_whole(tmp_path: Path) -> None:
     assert [path.name for path in folder.parent.iterdir()] == ["one"]
 
 
+def test_a_run_with_failures_is_not_done(tmp_path: Path) -> None:
+    store.write_json(tmp_path / "manifest.json", {"failures": {}})
+    assert store.is_done(tmp_path)
+    store.write_json(tmp_path / "manifest.json", {"failures": {"figure fit": "no ink"}})
+    assert not store.is_done(tmp_path)
+
+
 def test_a_failure_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> None:
     folder = tmp_path / "one"
     with store.writing(folder) as temporary:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
-
-import numpy as np
 
 from experiments.junction_metrics import structure
 from experiments.scenarios.scene import Scene
 from inference import rjmcmc
 from inference.posterior import Posterior
 from inference.progress import Progress
-from models.intersection.packing import MAX_ARMS
 from models.intersection.state import Junction
 from models.intersection.tracks import Tracks
 from models.program import InputError
@@ -45,11 +41,10 @@ QUICK = Effort(scenes=100, few=50, timed=10, repeats=2, real_seeds=5)
 
 
 class Setting(NamedTuple):
-    """A model, how it is run, and a first state from the tracks where it is not the engine's own."""
+    """A model and how it is run."""
 
     model: Junction
     knobs: dict[str, Any]
-    first: Callable[[Tracks], dict[str, Any]] | None = None
 
 
 class Trial(NamedTuple):
@@ -73,17 +68,9 @@ class Trial(NamedTuple):
         return 1e6 * self.chain / self.posterior.info["evaluations"]
 
 
-ANNEALED = {"num_chains": 1, "num_steps": 5000, "warmup": 5000, "start": "data", "start_temperature": 10.0}
+NUM_CHAINS = 2
+ANNEALED = {"num_chains": NUM_CHAINS, "num_steps": 2500, "warmup": 2500, "start": "data", "start_temperature": 10.0}
 DEFAULT = Setting(Junction(), ANNEALED | {"polish": True})
-
-
-def m20_start(tracks: Tracks) -> dict[str, Any]:
-    """Three arms 120 degrees apart at the centroid of the points, gap 1 m, one lane each way; [M20] gives none."""
-    angle = np.linspace(-math.pi, math.pi, MAX_ARMS, endpoint=False)  # inactive slots may hold anything
-    angle[:3] = np.radians([0.0, 120.0, -120.0])
-    ones = np.ones(MAX_ARMS, dtype=np.int64)
-    centre = tracks.points.mean(0)
-    return {"num_arms": 3, "centre": centre, "angle": angle, "gap": np.ones(MAX_ARMS), "entries": ones, "exits": ones}
 
 
 @lru_cache
@@ -101,8 +88,8 @@ def configured(name: str) -> Junction:
 def m20(likelihood: Literal["half", "point"] = "half", acceptance: Literal["paper", "printed"] = "paper") -> Setting:
     """[M20] as far as it is printed (config model=junction_m20), with our start and schedule T = 50 -> 1."""
     model = replace(configured("junction_m20"), likelihood=likelihood)
-    steps = {"num_chains": 1, "num_steps": 5000, "warmup": 5000, "start_temperature": 50.0}
-    return Setting(model, steps | {"acceptance": acceptance}, m20_start)
+    steps = {"num_chains": 1, "num_steps": 5000, "warmup": 5000, "start": "data", "start_temperature": 50.0}
+    return Setting(model, steps | {"acceptance": acceptance})
 
 
 def paper_lanes() -> Junction:
@@ -116,9 +103,8 @@ def attempt(setting: Setting, tracks: Tracks, seed: int) -> Trial:
     """Run one scene. Raises InputError where the model or the engine refuses the tracks."""
     began = time.perf_counter()
     evidence = setting.model.prepare(tracks)
-    first = setting.first(tracks) if setting.first else None
     prepared = time.perf_counter() - began
-    posterior = rjmcmc.run(setting.model, evidence, seed=seed, init=first, **setting.knobs)
+    posterior = rjmcmc.run(setting.model, evidence, seed=seed, **setting.knobs)
     total = time.perf_counter() - began
     assert posterior.snapshots is not None
     seconds, polished = posterior.snapshots.seconds, setting.knobs.get("polish", False)

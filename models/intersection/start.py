@@ -128,8 +128,9 @@ def start_from_halves(model: Junction, evidence: JunctionEvidence) -> dict[str, 
 def m20_start(model: Junction, evidence: JunctionEvidence) -> dict[str, Any]:
     """{site: (*event)}: the mean of the points, three arms 120 degrees apart, gap 1 m, one lane each way."""
     assert evidence.points is not None
+    points = evidence.points[:2].numpy().T if evidence.whole is None else evidence.whole.points
     z = np.zeros(SIZE)
-    z[0], z[1:HEAD] = 3, evidence.points[:2].mean(1).numpy()
+    z[0], z[1:HEAD] = 3, points.mean(0)
     slots = z[HEAD:].reshape(MAX_ARMS, ARM)
     slots[:, ANGLE] = np.array([0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0]) * 2.0 * math.pi / 3.0
     slots[:, GAP], slots[:, ENTRIES], slots[:, EXITS], slots[:, WIDTH] = 1.0, 1.0, 1.0, model.width

@@ -120,7 +120,7 @@ def test_written_tracks_are_read_again(tmp_path: Path, heading_std: float | None
 
 
 def test_no_junction_of_the_protocol_is_taken_for_one_road(tmp_path: Path) -> None:
-    for seed in range(20):  # seed 3 has three arms, two of them 28 degrees apart
+    for seed in range(20):  # seed 3 has three arms, two of them 35 degrees apart
         write(tmp_path / "tracks.csv", protocol(seed, tracks=1).data)
         csv(str(tmp_path / "tracks.csv"))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from inference.acceptance import log_acceptance
 from inference.polish import polish
-from models.capability import Kernel, kernel_types
+from models.capability import Kernel, kernel_types, pointer
 from models.program import InputError
 
 Array = NDArray[Any]
@@ -85,6 +85,7 @@ class CompiledChains:
         self.log_terms = np.empty((num_chains, 2))
         self.each_counts = np.zeros((num_chains, num_moves, 3))
         self.chain = compiled_chain()
+        self.functions = tuple(pointer(f) for f in (kernel.propose, kernel.evaluate, kernel.commit))
         with np.errstate(divide="ignore"):
             self.chances = np.concatenate([np.cumsum(kernel.probabilities), np.log(kernel.probabilities)])
         for c in range(num_chains):
@@ -119,7 +120,7 @@ class CompiledChains:
             uniforms = self.rngs[c].random((len(temperatures), 2 + kernel.num_uniforms))
             state = (self.z[c], self.log_terms[c], self.tops[c], uniforms, temperatures, setup)
             data = (kernel.floats, kernel.ints, self.caches[c], draws[c], self.each_counts[c])
-            self.chain(kernel.propose, kernel.evaluate, kernel.commit, *state, *data)
+            self.chain(*self.functions, *state, *data)
 
         if self.num_workers > 1:
             with ThreadPoolExecutor(self.num_workers) as pool:

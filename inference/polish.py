@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.capability import Kernel, kernel_types
+from models.capability import Kernel, kernel_types, pointer
 
 REFITS = 12  # Gauss-Newton steps after an edit, at most
 PATIENCE = 2  # refits after which an edit must be close to the best
@@ -68,6 +68,6 @@ def polish(kernel: Kernel, z: NDArray[np.float64]) -> tuple[NDArray[np.float64],
     """The mode near a packed state (D,) and its log joint. Needs a kernel with edits and a refit."""
     z, score = z.copy(), np.empty(1)
     cache = np.zeros(kernel.cache_size)
-    functions = (kernel.edit, kernel.refit, kernel.evaluate, kernel.commit)
+    functions = (pointer(f) for f in (kernel.edit, kernel.refit, kernel.evaluate, kernel.commit))
     _compiled_climb()(*functions, kernel.num_edits, z, kernel.floats, kernel.ints, cache, score)
     return z, float(score[0])

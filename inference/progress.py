@@ -10,11 +10,16 @@ from contextlib import contextmanager
 from typing import Any
 
 PATIENCE = 2.0  # [s]
+_watched: set[str] = set()
 
 
 @contextmanager
 def announce(what: str, after: float = 1.0) -> Iterator[None]:
-    """Print one line if the block takes longer than `after` seconds."""
+    """Print one line if the block takes longer than `after` seconds; watched the first time in a process only."""
+    if what in _watched:
+        yield
+        return
+    _watched.add(what)
     message = f"{what} (the first run on a machine only) ..."
     timer = threading.Timer(after, lambda: print(message, file=sys.stderr, flush=True))
     timer.daemon = True

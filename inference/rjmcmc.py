@@ -219,7 +219,7 @@ def run(
     thin = min(thin, num_steps - keep_from)
     chains: Chains
     if path != "batched" and hasattr(model, "kernel"):
-        with announce("compiling the sampler"):
+        with announce(f"compiling the sampler for {type(model).__name__}"):
             from inference.compiled_chain import CompiledChains
 
             kernel = model.kernel(evidence)

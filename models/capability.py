@@ -18,6 +18,7 @@ the step and of its reverse in natural units [rad, m], and the Jacobian of the d
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -65,8 +66,8 @@ class HasMoves(Protocol):
 class Kernel(NamedTuple):
     """A compiled density over packed states, for engines that run whole chains in machine code.
 
-    The functions are numba functions with the signatures of `kernel_types`, so that the compiled
-    chain is shared by all models and kept in the disk cache. `floats` and `ints` hold the data.
+    The functions are numba functions with the signatures of `kernel_types`, so that the compiled chain
+    is shared by all models and kept in the disk cache. `floats` and `ints` hold the data.
 
     propose(kind, z, u, floats, ints, z_new, u_new, log_q) -> valid
         the involution of the model's moves; log_q = (forward, backward, jacobian)
@@ -113,3 +114,27 @@ def kernel_types() -> dict[str, Any]:
         "index": index,
         "function": types.FunctionType,
     }
+
+
+@lru_cache
+def pointer(function: Any) -> Any:
+    """A compiled numba function of one explicit signature as a plain function pointer.
+
+    Passing the function itself to machine code looks its address up at every call, which takes longer than
+    fifty steps of a chain; a pointer is found once."""
+    from numba.core.types import WrapperAddressProtocol
+
+    (signature,) = function.nopython_signatures
+    result = function.get_compile_result(signature)
+    address = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+
+    class Pointer(WrapperAddressProtocol):
+        owner = function  # keeps the machine code alive
+
+        def __wrapper_address__(self) -> int:
+            return int(address)
+
+        def signature(self) -> Any:
+            return signature
+
+    return Pointer()

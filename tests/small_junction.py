@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
 from inference.calibration import predict
 from models.intersection.evidence import JunctionEvidence
@@ -44,10 +45,12 @@ def blank_evidence(
     return JunctionEvidence(None, s, starts, num_entries, np.array([3.0, -7.0]), heading, None)
 
 
-def states(model: Junction, num: int, seed: int, evidence: JunctionEvidence | None = None) -> Latents:
+NOTHING = blank_evidence(0, 0)._replace(points=torch.zeros(3, 0, dtype=torch.float64))  # no half track at all
+
+
+def states(model: Junction, num: int, seed: int, evidence: JunctionEvidence = NOTHING) -> Latents:
     """Prior draws of the latents (num, *event)."""
-    draws = simulate(model, evidence or blank_evidence(), num=num, seed=seed)
-    return {name: value for name, value in draws.items() if name != "points"}
+    return simulate(model, evidence, num=num, seed=seed)
 
 
 def one(latents: Latents, row: int) -> Latents:

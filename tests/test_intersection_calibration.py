@@ -71,7 +71,7 @@ LONG = pytest.mark.slow
 
 
 @pytest.mark.parametrize("model", [MODEL, PAPER], ids=["extended", "m20"])
-@pytest.mark.parametrize(("num", "num_steps"), [(250, 6), pytest.param(3000, 30, marks=LONG)], ids=["short", "long"])
+@pytest.mark.parametrize(("num", "num_steps"), [(200, 5), pytest.param(1500, 20, marks=LONG)], ids=["short", "long"])
 def test_joint_test_passes(model: Junction, num: int, num_steps: int) -> None:
     """Up to ten standard normal z-scores: one in two thousand such sets exceeds 4 (the seed is fixed)."""
     scores = joint_test(model, num, num_steps)
@@ -97,7 +97,7 @@ def engine(num_steps: int) -> calibration.Engine:
 
 
 @pytest.mark.parametrize(
-    ("num", "num_steps"), [(60, 20_000), pytest.param(1000, 100_000, marks=LONG)], ids=["short", "long"]
+    ("num", "num_steps"), [(50, 20_000), pytest.param(400, 60_000, marks=LONG)], ids=["short", "long"]
 )
 def test_ranks_of_the_truth_are_uniform(num: int, num_steps: int) -> None:
     """Simulation-based calibration; p below 1e-4 in one of ten functionals has odds of 1 in 1000."""

@@ -16,8 +16,8 @@ from torch import Tensor
 from inference import calibration, rjmcmc
 from inference.compiled_chain import CompiledChains
 from models.program import Latents
-from tests.small_junction import FULL, SETTINGS, blank_evidence, states
-from tests.test_intersection_prior import NOTHING, Alone, batched_scores, functionals, z_scores
+from tests.small_junction import FULL, NOTHING, SETTINGS, blank_evidence, states
+from tests.test_intersection_prior import Alone, batched_scores, functionals, z_scores
 
 Rule = Callable[..., Tensor]
 EXACT: Rule = rjmcmc.log_acceptance
@@ -59,7 +59,7 @@ def test_compiled_chain_of_one_move_notices(acceptance: str, kind: str, witness:
     """200 chains of 3000 steps of one kind of move, from prior draws."""
     kernel = FULL.kernel(NOTHING)
     kernel = kernel._replace(probabilities=np.array([float(name == kind) for name in kernel.move_names]))
-    z = kernel.pack({n: v.numpy() for n, v in states(FULL, 200, seed=5, evidence=NOTHING).items()})
+    z = kernel.pack({n: v.numpy() for n, v in states(FULL, 200, seed=5).items()})
     rule = rjmcmc.RULES["exact" if exact else acceptance]
     chains = CompiledChains(kernel, z, rule, 3000, 0, np.random.SeedSequence(6).spawn(200), 1)
     chains.advance(0, np.ones(3000))

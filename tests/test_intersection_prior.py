@@ -24,10 +24,9 @@ from models.intersection.angles import MIN_SEPARATION, HardCoreAngles
 from models.intersection.packing import MAX_ARMS, MIN_ARMS
 from models.intersection.state import Junction
 from models.program import Latents, quiet_doubles
-from tests.small_junction import FULL, NO_BENDS, SETTINGS, blank_evidence, states
+from tests.small_junction import FULL, NO_BENDS, NOTHING, SETTINGS, states
 
 Array = NDArray[Any]
-NOTHING = blank_evidence(0, 0)._replace(points=torch.zeros(3, 0, dtype=torch.float64))  # no half track at all
 MODELS = {
     "extended": FULL,
     "m20": Junction(**NO_BENDS, steps="m20"),
@@ -63,7 +62,7 @@ def functionals(z: dict[str, Any]) -> dict[str, Array]:
 @cache
 def prior_values(model: Junction) -> dict[str, Array]:
     """Functionals of 1e5 prior draws."""
-    return functionals(states(model, 100_000, seed=99, evidence=NOTHING))
+    return functionals(states(model, 100_000, seed=99))
 
 
 def z_scores(model: Junction, chains: dict[str, Array]) -> dict[str, float]:
@@ -93,7 +92,7 @@ def test_compiled_chains_return_the_prior(name: str) -> None:
 def test_compiled_chains_find_the_prior_from_afar() -> None:
     """All chains start with two arms of one lane each way; the first third of their steps is left out."""
     model = MODELS["extended"]
-    first = {n: v[0] for n, v in states(model, 1, seed=0, evidence=NOTHING).items()}
+    first = {n: v[0] for n, v in states(model, 1, seed=0).items()}
     first |= {"num_arms": torch.tensor(2), "entries": torch.ones(7).long(), "exits": torch.ones(7).long()}
     first["angle"][:2] = torch.tensor([0.0, 0.5])
     posterior = rjmcmc.run(model, NOTHING, seed=2, init=first, num_chains=100, num_steps=15_000, warmup=5000, thin=20)

@@ -142,7 +142,7 @@ def test_exact_likelihood_of_an_arm_along_the_axis() -> None:
 
 
 def crossing_tracks(seed: int, heading: bool) -> Tracks:
-    """Eight tracks of 90 points, bent at the crossing."""
+    """Eight tracks of 90 points, bent at the crossing, and three that are seen nowhere else."""
     rng = np.random.default_rng(seed)
     parts, turns = [], []
     for _ in range(8):
@@ -153,7 +153,12 @@ def crossing_tracks(seed: int, heading: bool) -> Tracks:
                                way[::-1, None] * [math.cos(end), math.sin(end)]])  # fmt: skip
         parts.append(path + rng.uniform(-5, 5, 2) + rng.normal(0.0, 0.7, path.shape))
         turns.append(np.repeat([begin + math.pi, end], 45) + rng.normal(0.0, 0.2, 90))
-    return Tracks(np.concatenate(parts), np.concatenate(turns) if heading else None, np.arange(9) * 90)
+    for _ in range(3):
+        parts.append(np.linspace([-2.0, 1.0], [3.0, -2.0], 10) + rng.normal(0.0, 0.7, (10, 2)))
+        turns.append(rng.normal(0.0, 0.2, 10))
+    return Tracks(
+        np.concatenate(parts), np.concatenate(turns) if heading else None, np.cumsum([0] + [90] * 8 + [10] * 3)
+    )
 
 
 def split(evidence: JunctionEvidence, centre: Array, margin: int) -> Iterator[tuple[int, Array]]:
@@ -181,6 +186,8 @@ def brute_closest(model: Junction, z: Latents, evidence: JunctionEvidence) -> fl
         options = list(lanes(model, z, side))
         if not options:
             return -math.inf
+        if y.size == 0:
+            continue
         costs = []
         for lane in options:
             n = np.array([-math.sin(lane.angle), math.cos(lane.angle)])

@@ -155,8 +155,10 @@ def sum_arms(rows, pick, num_arms, first, last, num_lanes, low, second, clutter,
 
 
 @nb.njit(cache=True, error_model="numpy")
-def closest_arms(rows, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
-    """Score of halves first:last of one side with the closest lane each and multinomial counts."""
+def closest_arms(weights, rows, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
+    """Score of halves first:last of one side with the closest lane each and multinomial counts.
+
+    weights  (H,) of the mean residuals; 0 where a half has no points: it is on no lane"""
     if last == first:
         return 0.0
     if num_lanes < 0.5:
@@ -164,6 +166,8 @@ def closest_arms(rows, pick, num_arms, first, last, num_lanes, counts):  # type:
     counts[:] = 0.0
     total = 0.0
     for h in range(first, last):
+        if weights[h] == 0.0:
+            continue
         low, arm = math.inf, 0
         for a in range(num_arms):
             value = rows[int(pick[a]), a, 0, h]
@@ -192,7 +196,7 @@ def closest_points(points, begin, end, first, last, side, cx, cy, arms, num_arms
     """Score of halves first:last of one side, every point with its closest lane ([M20] III-B).
 
     Half h holds points begin[h]:end[h], rows (x, y, heading); noise = (position, heading) deviations.
-    A half counts for the lane that is closest to most of its points."""
+    A half counts for the lane that is closest to most of its points, one without points for none."""
     if last == first:
         return 0.0
     if num_lanes < 0.5:
@@ -204,6 +208,8 @@ def closest_points(points, begin, end, first, last, side, cx, cy, arms, num_arms
         turns[0, a], turns[1, a] = math.cos(arms[a, 0]), math.sin(arms[a, 0])
     total = 0.0
     for h in range(first, last):
+        if begin[h] == end[h]:
+            continue
         votes[:] = 0.0
         for i in range(begin[h], end[h]):
             low, arm, lane = math.inf, 0, 0

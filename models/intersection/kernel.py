@@ -21,7 +21,7 @@ from models.intersection.borrow import borrow
 from models.intersection.density import EXACT, HALF, LIKELIHOODS, POINT
 from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
 from models.intersection.halves import smooth
-from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS
+from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS, W_ACROSS
 from models.intersection.packing import ARM, ENTRIES, HEAD, MAX_ARMS, SIZE, pack, unpack
 from models.intersection.prior import GAP_MAX, log_prior, prior_numbers
 from models.intersection.refit import EDITS_PER_ARM, FREE, edit, quadratic_model, solve_spd, take_step
@@ -204,7 +204,7 @@ def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
             share = (floats[LOG_CLUTTER], floats[LOG_KEPT])
             out[1] += density.sum_arms(rows, pick, num, first, last, lanes, low, second, stray, *share)
         else:
-            out[1] += density.closest_arms(rows, pick, num, first, last, lanes, counts)
+            out[1] += density.closest_arms(coef[W_ACROSS], rows, pick, num, first, last, lanes, counts)
 
 
 def refit(z, floats, ints, cache):  # type: ignore[no-untyped-def]

@@ -78,6 +78,7 @@ def run(
 
     What fails once the engine has run takes nothing else with it: it is listed under `failures`."""
     from inference import diagnostics
+    from inference.progress import announce
     from models.program import check
 
     seconds: dict[str, float] = {}
@@ -103,7 +104,7 @@ def run(
     with stage("scenario"):
         scene = scenario()
     say(f"scenario   {scene.name}")
-    with stage("prepare"):
+    with stage("prepare"), announce("compiling the model", after=4.0):
         check_reads(model, scene.data)
         evidence = model.prepare(scene.data) if hasattr(model, "prepare") else scene.data
         check(model, evidence)

@@ -54,7 +54,8 @@ def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, sco
 
 
 @lru_cache(maxsize=1)
-def _compiled_climb() -> Any:
+def compiled_climb() -> Any:
+    """The greedy search for any kernel."""
     import numba as nb
 
     types = kernel_types()
@@ -69,5 +70,5 @@ def polish(kernel: Kernel, z: NDArray[np.float64]) -> tuple[NDArray[np.float64],
     z, score = z.copy(), np.empty(1)
     cache = np.zeros(kernel.cache_size)
     functions = (pointer(f) for f in (kernel.edit, kernel.refit, kernel.evaluate, kernel.commit))
-    _compiled_climb()(*functions, kernel.num_edits, z, kernel.floats, kernel.ints, cache, score)
+    compiled_climb()(*functions, kernel.num_edits, z, kernel.floats, kernel.ints, cache, score)
     return z, float(score[0])

@@ -212,7 +212,10 @@ def run(
             f"rjmcmc needs 0 <= warmup <= num_steps, num_chains >= 1, thin >= 1 and start_temperature >= 1, but got "
             f"{warmup}, {num_steps}, {num_chains}, {thin}, {start_temperature}"
         )
-    init = model.start(evidence) if start == "data" and init is None else init  # type: ignore[attr-defined]
+    if init is not None:
+        _check_init(model, evidence, init)
+    elif start == "data":
+        init = model.start(evidence)  # type: ignore[attr-defined]
     entropy, shared, *seeds = np.random.SeedSequence(seed).spawn(num_chains + 2)
     latents = first_states(model, evidence, init, num_chains, int(entropy.generate_state(1)[0]))
     keep_from = min(warmup, num_steps - 1)
@@ -221,10 +224,13 @@ def run(
     if path != "batched" and hasattr(model, "kernel"):
         with announce(f"compiling the sampler for {type(model).__name__}"):
             from inference.compiled_chain import CompiledChains
+            from inference.polish import compiled_climb
 
             kernel = model.kernel(evidence)
             z = kernel.pack({n: v.numpy() for n, v in latents.items()})
             chains = CompiledChains(kernel, z, RULES[acceptance], thin, keep_from, seeds, num_workers)
+            if polish:
+                compiled_climb()  # now, so that it is not timed with the chains
     else:
         chains = BatchedChains(model, evidence, latents, RULES[acceptance], thin, keep_from, shared)
     _check_start(chains)
@@ -245,6 +251,12 @@ def run(
         chains.polish()
         shots.append(_snapshot(chains, num_steps, began))
     return _posterior(model, chains, draws, shots, time.perf_counter() - began)
+
+
+def _check_init(model: Any, evidence: Any, init: Latents) -> None:
+    sites = simulate(model, evidence, num=1, seed=0).keys()
+    if init.keys() != sites:
+        raise InputError(f"init must give a value to each of {sorted(sites)}, but gives {sorted(init)}")
 
 
 def _check_start(chains: Chains) -> None:

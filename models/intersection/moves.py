@@ -10,8 +10,8 @@ directions of an arm move carry 1 / K, and the set factor of the paper's notatio
 
 Ours: with small steps, a step is shortened by exp(-3.5 U[0, 1]) in seven cases of ten (the scale is kept by
 the reverse step). Toggles give or take an inner lane and move gap and axis so that all other lanes stay
-(volume preserving). Width scales by exp(U[-0.15, 0.15]), with Jacobian w'/w, bare or with the gap moved so
-that the middle of the lanes stays.
+(volume preserving). A pivot shifts the centre and turns the arms about their points. Width scales by
+exp(U[-0.15, 0.15]), with Jacobian w'/w, bare or with the gap moved so that the middle of the lanes stays.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from models.intersection.prior import (
     log_slot,
 )
 
-ROTATE, CENTRE, CHANGE_GAP, ARMS, LANES, TOGGLE, SCALE_WIDTH, CHANGE_BEND, CHANGE_SHIFT = range(9)
-NAMES = ("rotate", "centre", "gap", "arms", "lanes", "toggle", "width", "bend", "shift")
+ROTATE, CENTRE, CHANGE_GAP, ARMS, LANES, TOGGLE, SCALE_WIDTH, CHANGE_BEND, CHANGE_SHIFT, PIVOT = range(10)
+NAMES = ("rotate", "centre", "gap", "arms", "lanes", "toggle", "width", "bend", "shift", "pivot")
 NUM_UNIFORMS = 10
 SMALL_STEPS = NUM_PRIOR  # position in the kernel's floats: 1 mixes in small steps
 NUM_SETTINGS = NUM_PRIOR + 1
@@ -46,9 +46,9 @@ NUM_SETTINGS = NUM_PRIOR + 1
 MAX_CENTRE = 6.0  # [m]
 MAX_LOG_WIDTH = 0.15
 # fields that walk by themselves, by kind, and their longest steps: 6 degrees, 1.8 m, 0.004 / m, 1 m
-WALK_FIELD = np.array([ANGLE, 0, GAP, 0, 0, 0, 0, BEND, SHIFT])
-WALK_SIZE = np.array([math.radians(6.0), 0.0, 1.8, 0.0, 0.0, 0.0, 0.0, 0.004, 1.0])
-LEVER = 38.0  # [m] mean distance of the points from the centre: turns a lateral step into a rotation
+WALK_FIELD = np.array([ANGLE, 0, GAP, 0, 0, 0, 0, BEND, SHIFT, 0])
+WALK_SIZE = np.array([math.radians(6.0), 0.0, 1.8, 0.0, 0.0, 0.0, 0.0, 0.004, 1.0, 0.0])
+LEVER = 45.0  # [m] mean distance of the points from the centre: turns a lateral step into a rotation
 
 
 @nb.njit(cache=True)
@@ -343,6 +343,38 @@ def shift_centre(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untype
     log_q[0] = log_q[1] = -math.log(size * 2.0 * math.pi)
 
 
+@nb.njit(cache=True)
+def pivot(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
+    """Shift the centre by delta while the arms stay where their points are.
+
+    With u[4] < 1/2 and shifts that are latent, shift' = shift - n . delta: the lanes do not move at all. Else every
+    arm turns about a point LEVER away, by the implicit midpoint rule, which its reverse undoes exactly:
+
+        alpha' = alpha - n(m) . delta / LEVER,  m = (alpha + alpha') / 2,
+        d alpha' / d alpha = (1 + d(m) . delta / (2 LEVER)) / (1 - d(m) . delta / (2 LEVER))"""
+    shift_centre(z, u, settings, z_new, u_new, log_q)
+    dx, dy = z_new[1] - z[1], z_new[2] - z[2]
+    num = int(z[0])
+    for a in range(num):
+        o = HEAD + a * ARM
+        angle = z[o + ANGLE]
+        if settings[SHIFT_STD] > 0.0 and u[4] < 0.5:
+            z_new[o + SHIFT] -= -math.sin(angle) * dx + math.cos(angle) * dy
+            continue
+        turned = angle
+        for _ in range(20):
+            middle = 0.5 * (angle + turned)
+            turned = angle - (-math.sin(middle) * dx + math.cos(middle) * dy) / LEVER
+        middle = 0.5 * (angle + turned)
+        lean = (math.cos(middle) * dx + math.sin(middle) * dy) / (2.0 * LEVER)
+        log_q[2] += math.log((1.0 + lean) / (1.0 - lean))
+        z_new[o + ANGLE] = wrap(turned)
+    for a in range(1, num):
+        if not apart(z_new, a, z_new[HEAD + a * ARM + ANGLE], a):
+            return False
+    return True
+
+
 def propose(kind, z, u, floats, ints, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """One involution; returns False where the step leaves the state space."""
     z_new[:] = z
@@ -357,6 +389,8 @@ def propose(kind, z, u, floats, ints, z_new, u_new, log_q):  # type: ignore[no-u
         return change_lanes(z, u, floats, z_new, u_new, log_q)
     if kind == TOGGLE:
         return toggle(z, u, floats, z_new, u_new, log_q)
+    if kind == PIVOT:
+        return pivot(z, u, floats, z_new, u_new, log_q)
     if kind == SCALE_WIDTH:
         return scale_width(z, u, floats, z_new, u_new, log_q)
     return walk_field(kind, z, u, floats, z_new, u_new, log_q)
@@ -367,7 +401,7 @@ def probabilities(steps: str, latent: dict[str, bool]) -> dict[int, float]:
     if steps == "m20":
         table = {ROTATE: 0.30, CENTRE: 0.22, CHANGE_GAP: 0.16, ARMS: 0.05, LANES: 0.27}
     else:
-        table = {ROTATE: 0.25, CENTRE: 0.16, CHANGE_GAP: 0.14, ARMS: 0.05, LANES: 0.20, TOGGLE: 0.20}
+        table = {ROTATE: 0.25, CENTRE: 0.08, PIVOT: 0.08, CHANGE_GAP: 0.14, ARMS: 0.05, LANES: 0.20, TOGGLE: 0.20}
     table |= {SCALE_WIDTH: 0.10} if latent["width"] else {}
     table |= {CHANGE_BEND: 0.06} if latent["bend"] else {}
     table |= {CHANGE_SHIFT: 0.06} if latent["shift"] else {}

@@ -30,4 +30,4 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .compiled .mypy_cache .pytest_cache .ruff_cache

@@ -28,7 +28,7 @@ SETTINGS: dict[str, Any] = {
     "phase_std": 20.0,
     "heading_std": 0.3,
     "clutter": 0.02,
-    "clutter_radius": 60.0,
+    "clutter_std": 40.0,
 }
 NO_BENDS: dict[str, Any] = SETTINGS | {"width_spread": 0.0, "bend_std": 0.0, "shift_std": 0.0}
 FULL = Junction(**SETTINGS)

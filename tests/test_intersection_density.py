@@ -25,7 +25,7 @@ from models.program import Latents, log_joint, terms
 from tests.small_junction import FULL, blank_evidence, one, states, with_points
 
 Array = NDArray[np.float64]
-MODEL = replace(FULL, clutter_radius=80.0)
+MODEL = replace(FULL, clutter_std=50.0)
 STRAIGHT = replace(MODEL, bend_std=0.0, shift_std=0.0, width_spread=0.0)
 
 
@@ -86,7 +86,8 @@ def brute_exact(model: Junction, z: Latents, evidence: JunctionEvidence) -> floa
         rows = slice(evidence.starts[h], evidence.starts[h + 1])
         y, s = points[:, rows], evidence.s[rows]
         options = list(lanes(model, z, side))
-        stray = -len(s) * math.log(math.pi * model.clutter_radius**2)
+        stray = -len(s) * math.log(2 * math.pi * model.clutter_std**2)
+        stray -= 0.5 * float(np.square(y[:2]).sum()) / model.clutter_std**2
         stray -= len(s) * math.log(2 * math.pi) if evidence.heading else 0.0
         if not options:
             total += stray
@@ -277,9 +278,8 @@ def test_exact_likelihood_is_normalised(num_points: int) -> None:
     """Over y ~ (p(y | z1) + p(y | z2)) / 2 the mean of (p(y | z1) - p(y | z2)) / (p(y | z1) + p(y | z2)) is zero.
 
     z2 has other numbers of lanes than z1 and its lanes lie close to those of z1: a density that rewards lanes,
-    as closest lanes do, fails. Values lie in [-1, 1]; four standard errors. Stray points are uniform in a disc
-    which the density does not bound: it is chosen wide enough to hold all lanes."""
-    model = replace(MODEL, clutter=0.2, clutter_radius=200.0)
+    as closest lanes do, fails. Values lie in [-1, 1]; four standard errors."""
+    model = replace(MODEL, clutter=0.2)
     blank = blank_evidence(1, 1, num_points=num_points)
     z1 = states(model, 1, seed=11)
     z2 = {n: v.clone() for n, v in z1.items()}

@@ -11,7 +11,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from models.intersection import halves as hv
-from models.intersection.moments import NUM_COEFFICIENTS, along_moments, coefficients, moments
+from models.intersection.moments import (
+    COUNT,
+    CXX,
+    CYY,
+    MX,
+    MY,
+    NUM_COEFFICIENTS,
+    along_moments,
+    coefficients,
+    log_normaliser,
+    moments,
+)
 from models.intersection.tracks import Tracks
 from models.program import InputError
 
@@ -89,16 +100,15 @@ def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Arra
     return out
 
 
-def clutter_costs(evidence: JunctionEvidence, model: Junction) -> tuple[Array, Array]:
+def clutter_costs(evidence: JunctionEvidence, observed: Array, model: Junction) -> tuple[Array, Array]:
     """(H,) log normaliser of a half on a lane, and -log density of a stray half beyond it.
 
-    The points of a stray half are uniform in a disc, its headings on the circle."""
-    from models.intersection.moments import COUNT, log_normaliser
-
+    The points of a stray half are N(origin, clutter_std^2 I), its headings uniform on the circle."""
     along = along_moments(evidence.s, evidence.starts)
     noise = model.noise if evidence.heading else model.noise._replace(heading=math.inf)
-    front = log_normaliser(along, noise)
-    stray = along[COUNT] * math.log(math.pi * model.clutter_radius**2)
+    front, num, variance = log_normaliser(along, noise), along[COUNT], model.clutter_std**2
+    squares = observed[CXX] + observed[CYY] + num * (observed[MX] ** 2 + observed[MY] ** 2)
+    stray = num * math.log(2 * math.pi * variance) + 0.5 * squares / variance
     if evidence.heading:
-        stray = stray + along[COUNT] * math.log(2 * math.pi)
+        stray = stray + num * math.log(2 * math.pi)
     return front, stray + front

@@ -253,7 +253,7 @@ def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> 
     log_share = [math.log(model.clutter) if model.clutter > 0 else -math.inf, math.log1p(-model.clutter)]
     heading = model.heading_std
     if kind == EXACT:
-        front, stray = clutter_costs(evidence, model)
+        front, stray = clutter_costs(evidence, observed, model)
         stray = stray if model.clutter > 0 else np.full_like(stray, 0.1 * density.NO_LANE)
         head = [*settings(model), *log_share, model.position_std, heading, front.sum()]
         floats = np.concatenate([head, scaled(evidence, observed, model).ravel(), stray])

@@ -120,7 +120,6 @@ def _draw_points(model: Junction, evidence: JunctionEvidence, one: dict[str, Ten
     x, y = centre[0] + along * cos - across * sin, centre[1] + along * sin + across * cos
     heading = angle[half] + torch.where(incoming, math.pi, 0.0)[half] + bend[half] * (s - CHORD / 2)
     heading = heading + noise.heading * torch.randn(len(s))
-    radius, turn = model.clutter_radius * torch.rand(len(s)).sqrt(), 2 * math.pi * torch.rand(len(s))
     anywhere = 2 * math.pi * torch.rand(len(s)) - math.pi
-    stray = torch.stack([radius * torch.cos(turn), radius * torch.sin(turn), anywhere])
+    stray = torch.cat([model.clutter_std * torch.randn(2, len(s)), anywhere[None]])
     return torch.where(lost[half], stray, torch.stack([x, y, heading]))

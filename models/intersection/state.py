@@ -64,7 +64,7 @@ class Junction:
     phase_std: float = 20.0  # of a whole half track along its lane [m]
     heading_std: float = 0.3  # of a measured heading about the arm [rad]
     clutter: float = 0.02  # share of half tracks on no lane
-    clutter_radius: float = 60.0  # where their points are uniform [m]
+    clutter_std: float = 40.0  # of their points about where the tracks meet [m]
     inner_radius: float = 30.0  # points closer to the crossing are on no arm [m]
 
     def __post_init__(self) -> None:

@@ -362,9 +362,11 @@ def pivot(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
             z_new[o + SHIFT] -= -math.sin(angle) * dx + math.cos(angle) * dy
             continue
         turned = angle
-        for _ in range(20):
-            middle = 0.5 * (angle + turned)
+        for _ in range(20):  # a step of 6 m gains a digit each time
+            middle, before = 0.5 * (angle + turned), turned
             turned = angle - (-math.sin(middle) * dx + math.cos(middle) * dy) / LEVER
+            if abs(turned - before) < 1e-15:
+                break
         middle = 0.5 * (angle + turned)
         lean = (math.cos(middle) * dx + math.sin(middle) * dy) / (2.0 * LEVER)
         log_q[2] += math.log((1.0 + lean) / (1.0 - lean))
@@ -401,7 +403,7 @@ def probabilities(steps: str, latent: dict[str, bool]) -> dict[int, float]:
     if steps == "m20":
         table = {ROTATE: 0.30, CENTRE: 0.22, CHANGE_GAP: 0.16, ARMS: 0.05, LANES: 0.27}
     else:
-        table = {ROTATE: 0.25, CENTRE: 0.08, PIVOT: 0.08, CHANGE_GAP: 0.14, ARMS: 0.05, LANES: 0.20, TOGGLE: 0.20}
+        table = {ROTATE: 0.25, CENTRE: 0.07, PIVOT: 0.05, CHANGE_GAP: 0.16, ARMS: 0.05, LANES: 0.22, TOGGLE: 0.20}
     table |= {SCALE_WIDTH: 0.10} if latent["width"] else {}
     table |= {CHANGE_BEND: 0.06} if latent["bend"] else {}
     table |= {CHANGE_SHIFT: 0.06} if latent["shift"] else {}

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import pyro
@@ -70,7 +70,10 @@ class _Frozen(Messenger):
 
     def _pyro_sample(self, msg: Any) -> None:
         if msg["name"] in self.values:
-            msg["value"], msg["is_observed"], msg["done"] = self.values[msg["name"]], True, True
+            value = self.values[msg["name"]]
+            if not msg["fn"].support.is_discrete:
+                value = value.double()  # a Normal about an integer rounds its scale to one
+            msg["value"], msg["is_observed"], msg["done"] = value, True, True
             msg["infer"] = msg["infer"] | {"frozen": True}
 
 
@@ -110,16 +113,22 @@ def _sites(model: Model, evidence: Any, handler: Messenger) -> dict[str, Site]:
         return _sample_sites(model, evidence)
 
 
+def _is_frozen(site: Site) -> bool:
+    return site["infer"].get("frozen", False)
+
+
 def _is_evidence(site: Site) -> bool:
-    return site["is_observed"] and not site["infer"].get("frozen", False)
+    return site["is_observed"] and not _is_frozen(site)
+
+
+def _log_prob(site: Site) -> Tensor:
+    with pyro.validation_enabled(False):
+        return site["fn"].log_prob(site["value"])
 
 
 def _site_log_prob(name: str, site: Site) -> Tensor:
     """Log density of one site, -inf outside its support, (*batch, *plates)."""
-    fn, value = site["fn"], site["value"]
-    with pyro.validation_enabled(False):
-        log_prob = fn.log_prob(value)
-    inside = fn.support.check(value)
+    log_prob, inside = _log_prob(site), site["fn"].support.check(site["value"])
     if not bool(inside.all()):
         log_prob = torch.where(inside, log_prob, -torch.inf)
     if site["mask"] is not None:
@@ -200,7 +209,8 @@ def fix(model: Model, **values: Tensor | float) -> Fixed:
     """Freeze sites at values; what remains is an ordinary program over the other sites.
 
     The frozen sites keep contributing their prior density to `log_joint`."""
-    return Fixed(model, {name: torch.as_tensor(value) for name, value in values.items()})
+    with quiet_doubles():
+        return Fixed(model, {name: torch.as_tensor(value) for name, value in values.items()})
 
 
 def check(model: Model, evidence: Any) -> None:
@@ -288,13 +298,18 @@ def _no_whitening(name: str, fn: Any) -> InputError:
     )
 
 
-def _gaussian_scale(name: str, fn: Any) -> Tensor:
-    base = _unwrap(fn)
+def _gaussian_scale(name: str, site: Site) -> Tensor:
+    base = _unwrap(site["fn"])
     if isinstance(base, dist.Normal):
         return base.scale
     if isinstance(base, dist.MultivariateNormal):
         return base.scale_tril
-    raise InputError(f"least squares needs Gaussian sites, but '{name}' is {_describe(fn)}; fix() it first")
+    if _is_frozen(site):
+        raise InputError(
+            f"least squares needs Gaussian sites, but the fixed '{name}' is {_describe(base)} and depends on latents; "
+            "fix() what it depends on"
+        )
+    raise InputError(f"least squares needs Gaussian sites, but '{name}' is {_describe(base)}; fix() it first")
 
 
 def _masked(site: Site, residual: Tensor) -> Tensor:
@@ -313,14 +328,16 @@ def _masked(site: Site, residual: Tensor) -> Tensor:
 
 
 def residuals(model: Model, latents: Latents, evidence: Any) -> dict[str, Tensor]:
-    """Whitened residuals of every site, (value - mean) / standard deviation.
+    """Whitened residuals of every site, (value - mean) / standard deviation; none of a frozen site
+    that does not depend on the latents.
 
     Half their squared sum is -log_joint up to a constant. Raises InputError by name for a site
     that is not Gaussian or whose scale depends on the latents (its log-determinant would be lost)."""
     latents = {n: v.detach().clone().requires_grad_(v.is_floating_point()) for n, v in latents.items()}
     sites = _sites(model, evidence, _Given(latents))
+    sites = {n: s for n, s in sites.items() if not _is_frozen(s) or _site_log_prob(n, s).requires_grad}
     for name, site in sites.items():
-        _refuse_latent_scale(name, _gaussian_scale(name, site["fn"]).requires_grad)
+        _refuse_latent_scale(name, _gaussian_scale(name, site).requires_grad)
     return {n: _masked(s, _to_standard(n, s["fn"], s["value"])).detach() for n, s in sites.items()}
 
 
@@ -338,12 +355,14 @@ class Bound:
 
         z = T(x),   log p(x | y) = log N(x; 0, I) + log p(y | T(x)) + const
 
-    Every latent is whitened by its own prior given its parents, so x is dimensionless."""
+    Every latent is whitened by its own prior given its parents, so x is dimensionless. y holds the
+    frozen sites beside the observed ones; `settled` names those whose density no x changes."""
 
     model: Model
     evidence: Any
     shapes: dict[str, torch.Size]
     pads: dict[str, int]
+    settled: frozenset[str] = frozenset()
 
     @property
     def size(self) -> int:
@@ -362,6 +381,16 @@ class Bound:
     def _run(self, x: Tensor) -> dict[str, Site]:
         return _sites(self.model, self.evidence, _Whitened(self._numbers(x)))
 
+    def _compared(self, x: Tensor) -> dict[str, Site]:
+        """The sites that have residuals: observed, or frozen below some latent."""
+        return {n: s for n, s in self._run(x).items() if s["is_observed"] and n not in self.settled}
+
+    def _prior_points(self, num: int) -> Iterator[Tensor]:
+        """The same few points for every check, with gradients."""
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(num):
+            yield torch.randn(self.size, generator=generator, dtype=torch.float64).requires_grad_()
+
     def latents(self, x: Tensor) -> Latents:
         """T(x): whitened numbers to latents, {site: (*batch, *event)}."""
         return {n: s["value"] for n, s in self._run(x).items() if n in self.shapes}
@@ -377,32 +406,39 @@ class Bound:
         return torch.cat(parts, -1)
 
     def log_density(self, x: Tensor) -> Tensor:
-        """log N(x; 0, I) + log p(y | T(x)), (*batch)."""
+        """log N(x; 0, I) + log p(y | T(x)), (*batch): log_joint plus the log Jacobian of T."""
         sites = self._run(x)
         plates = _plate_dims(sites)
-        likelihood = {n: _sum_plates(_site_log_prob(n, s), plates) for n, s in sites.items() if _is_evidence(s)}
+        likelihood = {n: _sum_plates(_site_log_prob(n, s), plates) for n, s in sites.items() if s["is_observed"]}
         return -0.5 * (x.square() + math.log(2 * math.pi)).sum(-1) + total(likelihood)
 
     def residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Prior residuals x (size) and whitened observation residuals (M), x unbatched."""
-        observed = {n: s for n, s in self._run(x).items() if _is_evidence(s)}
-        parts = [_masked(s, _to_standard(n, s["fn"], s["value"])).reshape(-1) for n, s in observed.items()]
+        """Prior residuals x (size) and whitened residuals of observed and frozen sites (M), x unbatched."""
+        parts = [_masked(s, _to_standard(n, s["fn"], s["value"])).reshape(-1) for n, s in self._compared(x).items()]
         return x, torch.cat(parts) if parts else x.new_zeros(0)
 
     def check_residuals(self) -> None:
-        """Raise InputError by name where the observations are not Gaussian or their scale depends
+        """Raise InputError by name where observed or frozen sites are not Gaussian or their scale depends
         on the latents: by dependency, and by change between points for what gradients cannot see."""
-        generator = torch.Generator().manual_seed(0)
         scales: dict[str, Tensor] = {}
-        for _ in range(4):
-            x = torch.randn(self.size, generator=generator, dtype=torch.float64).requires_grad_()
-            for name, site in self._run(x).items():
-                if not _is_evidence(site):
-                    continue
-                scale = _gaussian_scale(name, site["fn"])
+        for x in self._prior_points(4):
+            for name, site in self._compared(x).items():
+                scale = _gaussian_scale(name, site)
                 moved = name in scales and not torch.equal(scale, scales[name])
                 _refuse_latent_scale(name, scale.requires_grad or moved)
                 scales[name] = scale.detach()
+
+
+def _settled(bound: Bound, frozen: set[str]) -> frozenset[str]:
+    """Those frozen sites whose density depends on no latent: by dependency and by change, as above."""
+    still, seen = set(frozen), dict[str, Tensor]()
+    for x in bound._prior_points(4 if frozen else 0):
+        sites = bound._run(x)
+        for name in sorted(still):
+            log_prob = _log_prob(sites[name])
+            if log_prob.requires_grad or not torch.equal(log_prob, seen.setdefault(name, log_prob)):
+                still.remove(name)
+    return frozenset(still)
 
 
 def bind(model: Model, evidence: Any) -> Bound:
@@ -418,4 +454,5 @@ def bind(model: Model, evidence: Any) -> Bound:
             _to_standard(name, site["fn"], site["value"])
             shapes[name] = site["value"].shape
             pads[name] = plate_dims - (site["value"].dim() - site["fn"].event_dim)
-    return Bound(model, evidence, shapes, pads)
+    bound = Bound(model, evidence, shapes, pads)
+    return replace(bound, settled=_settled(bound, {name for name, site in sites.items() if _is_frozen(site)}))

@@ -85,8 +85,25 @@ def test_road_with_its_knots_fixed_is_exact() -> None:
     found = np.concatenate([np.atleast_1d(posterior.estimate[n]) for n in ("d0", "psi0", "kappa0", "rate")])
     np.testing.assert_allclose(found / std.numpy(), (gain @ evidence.d / std).numpy(), atol=1e-8)
     exact = dist.MultivariateNormal(torch.zeros(30, dtype=torch.float64), spread).log_prob(evidence.d)
-    assert posterior.log_evidence == pytest.approx(float(exact), abs=1e-7)
+    truncated = dist.Poisson(road.knots_mean).log_prob(torch.arange(5.0)).log_softmax(0)
+    fixed = float(truncated[2]) - 4 * math.log(road.length)  # the evidence is log p(d, num_knots, knot)
+    assert posterior.log_evidence == pytest.approx(float(exact) + fixed, abs=1e-6)
     assert posterior.info["flags"] == []
+
+
+def test_a_fixed_value_is_data_for_the_latents_above_it() -> None:
+    """mu ~ N(0, 1), x ~ N(mu, 0.1) fixed at 3: mean 3 / (1 + 0.01), evidence N(3; 0, 1.01) N(y; 3, 0.5)."""
+
+    def chain(evidence: Signal) -> None:
+        mu = pyro.sample("mu", dist.Normal(0.0, 1.0))
+        x = pyro.sample("x", dist.Normal(mu, 0.1))
+        pyro.sample("y", dist.Normal(x[..., None], 0.5).to_event(1), obs=evidence.y)
+
+    seen = Signal(T[:1], torch.tensor([2.5], dtype=torch.float64))
+    posterior = least_squares.run(fix(chain, x=3), seen, seed=0)
+    assert float(posterior.estimate["mu"]) == pytest.approx(3.0 / 1.01, abs=1e-8)
+    exact = dist.Normal(0.0, math.sqrt(1.01)).log_prob(torch.tensor(3.0)) + dist.Normal(3.0, 0.5).log_prob(seen.y[0])
+    assert posterior.log_evidence == pytest.approx(float(exact), abs=1e-6)
 
 
 def test_continuation_escapes_a_local_minimum() -> None:

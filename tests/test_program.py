@@ -160,6 +160,54 @@ def test_fixing_a_site_freezes_it_and_keeps_its_prior_density() -> None:
     assert "num_knots" not in simulate(frozen, evidence, num=2, seed=0)
 
 
+def chain(evidence: Observed) -> None:
+    """`x` depends on `mu`, `kind` on nothing."""
+    mu = pyro.sample("mu", dist.Normal(0.0, 1.0))
+    x = pyro.sample("x", dist.Normal(mu, 0.1))
+    kind = pyro.sample("kind", dist.Categorical(torch.tensor([0.2, 0.8])))
+    pyro.sample("y", dist.Normal((x + kind)[..., None].expand(*x.shape, 3), 0.5).to_event(1), obs=evidence.y)
+
+
+def test_a_frozen_site_counts_given_the_latents() -> None:
+    """Linear and Gaussian, so that the Jacobian of the whitening is a constant: here one."""
+    frozen = fix(chain, x=3.0, kind=1)
+    bound = bind(frozen, SEEN)
+    x = torch.tensor([[-1.0], [0.5], [2.9]], dtype=torch.float64)
+    torch.testing.assert_close(bound.log_density(x), log_joint(frozen, bound.latents(x), SEEN))
+    bound.check_residuals()
+    for costs in (
+        torch.stack([0.5 * sum(part.square().sum() for part in bound.residuals(row)) for row in x]),
+        torch.stack(
+            [0.5 * sum(p.square().sum() for p in residuals(frozen, {"mu": row[0]}, SEEN).values()) for row in x]
+        ),
+    ):
+        height = costs + bound.log_density(x)
+        torch.testing.assert_close(height, height[:1].expand(3))
+
+
+def test_frozen_sites_that_are_not_gaussian_are_skipped_unless_they_depend_on_latents() -> None:
+    frozen = fix(chain, x=3.0, kind=1)
+    assert bind(frozen, SEEN).settled == {"kind"}
+    assert set(residuals(frozen, {"mu": torch.tensor(0.1)}, SEEN)) == {"mu", "x", "y"}
+
+    def labelled(evidence: Observed) -> None:
+        mu = pyro.sample("mu", dist.Normal(0.0, 1.0))
+        pyro.sample("label", dist.Bernoulli(logits=mu))
+        pyro.sample("y", dist.Normal(mu[..., None].expand(*mu.shape, 3), 0.5).to_event(1), obs=evidence.y)
+
+    with pytest.raises(InputError, match="fixed 'label' is Bernoulli and depends on latents"):
+        bind(fix(labelled, label=1.0), SEEN).check_residuals()
+    with pytest.raises(InputError, match="fixed 'label' is Bernoulli and depends on latents"):
+        residuals(fix(labelled, label=1.0), {"mu": torch.tensor(0.1)}, SEEN)
+
+
+def test_a_fixed_value_keeps_its_digits_and_an_integer_stands_for_a_real() -> None:
+    latents = {"mu": torch.tensor(0.1, dtype=torch.float64)}
+    as_integer, as_real = (log_joint(fix(chain, x=x, kind=1), latents, SEEN) for x in (3, 3.0))
+    torch.testing.assert_close(as_integer, as_real, atol=0, rtol=0)
+    assert float(fix(chain, x=0.1).values["x"]) == 0.1
+
+
 def test_missing_and_unused_values_are_refused_by_name() -> None:
     with pytest.raises(InputError, match="'low' has no value"):
         log_joint(zoo, {"scale": torch.tensor(1.0)}, SEEN)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from inference.acceptance import log_acceptance
 from inference.polish import polish
 from models.capability import Kernel, kernel_types, pointer
-from models.program import InputError
 
 Array = NDArray[Any]
 acceptance = nb.njit(log_acceptance)
@@ -140,8 +139,6 @@ class CompiledChains:
         return self.kernel.unpack(row[:-1]), float(row[-1])
 
     def polish(self) -> None:
-        """Climb from the best state of every chain. Raises InputError where the kernel has no edits or refit."""
-        if self.kernel.refit is None:
-            raise InputError("polish=true needs a kernel with edits and a refit, but this model's has none")
+        """Climb from the best state of every chain; the kernel must have edits and a refit."""
         for row in self.tops:
             row[:-1], row[-1] = polish(self.kernel, row[:-1])

@@ -3,7 +3,8 @@
 A move maps (z, u), u uniform on the unit cube, to (z', u') and back; inference.acceptance says when the step is
 taken. Two paths run the same moves: a model with a kernel runs whole chains in machine code, any other program runs
 all chains in a batch. The warm-up may be annealed: temperatures fall geometrically to one. Chains may be resampled
-between themselves while they anneal, with weights p(y|z)^(1/T' - 1/T): chains in poor modes die out.
+between themselves while they anneal, with weights p(y|z)^(1/T' - 1/T), T' a block of steps ahead: chains in poor
+modes die out.
 """
 
 from __future__ import annotations
@@ -89,7 +90,6 @@ class Chains(Protocol):
     def advance(self, first: int, temperatures: Array) -> list[dict[str, Array]]: ...
     def choose(self, index: Array) -> None: ...
     def best(self) -> tuple[dict[str, Array], float]: ...
-    def polish(self) -> None: ...
 
 
 class BatchedChains:
@@ -104,6 +104,7 @@ class BatchedChains:
         self.rng = np.random.default_rng(seed)
         shares = np.array([move.probability for move in self.moves])
         self.shares = shares / shares.sum()
+        self.moves = tuple(m._replace(probability=p) for m, p in zip(self.moves, self.shares, strict=True))
         self.counts = np.zeros((len(self.moves), 3))
         self.state = init(model, latents, evidence)
         self.top: tuple[dict[str, Array], float] = ({}, -np.inf)
@@ -149,10 +150,6 @@ class BatchedChains:
     def best(self) -> tuple[dict[str, Array], float]:
         """The best state of all chains so far and its log joint."""
         return self.top
-
-    def polish(self) -> None:
-        """Refused: the greedy search needs a kernel."""
-        raise InputError(f"polish=true needs the compiled path, but {type(self.model).__name__} runs batched")
 
 
 def temperatures_of(num_steps: int, warmup: int, start_temperature: float) -> Array:
@@ -207,11 +204,22 @@ def run(
         raise InputError(f"start=data needs a model with start(), but {type(model).__name__} has none; use start=prior")
     if path == "compiled" and not hasattr(model, "kernel"):
         raise InputError(f"path=compiled needs a model with kernel(), but {type(model).__name__} has none")
-    if not 0 <= warmup <= num_steps or num_chains < 1 or thin < 1 or start_temperature < 1:
+    if acceptance not in RULES:
+        raise InputError(f"acceptance must be one of {', '.join(RULES)}, but is '{acceptance}'")
+    if not 0 <= warmup <= num_steps or num_steps < 1 or num_chains < 1 or num_workers < 1 or start_temperature < 1:
         raise InputError(
-            f"rjmcmc needs 0 <= warmup <= num_steps, num_chains >= 1, thin >= 1 and start_temperature >= 1, but got "
-            f"{warmup}, {num_steps}, {num_chains}, {thin}, {start_temperature}"
+            "rjmcmc needs 0 <= warmup <= num_steps, num_steps, num_chains and num_workers of at least 1 and "
+            f"start_temperature >= 1, but got {warmup}, {num_steps}, {num_chains}, {num_workers}, {start_temperature}"
         )
+    if thin < 1 or thin > max(num_steps - warmup, 1):
+        raise InputError(f"thin must be 1 to the {num_steps - warmup} steps after the warm-up, but is {thin}")
+    if resample and (warmup <= BLOCK or start_temperature == 1):
+        raise InputError(
+            f"resample=true acts every {BLOCK} steps while chains anneal; it needs a warmup longer than that and "
+            f"start_temperature > 1, but they are {warmup} and {start_temperature}"
+        )
+    if polish and (path == "batched" or not hasattr(model, "kernel")):
+        raise InputError(f"polish=true needs the compiled path, which {type(model).__name__} does not run on here")
     if init is not None:
         _check_init(model, evidence, init)
     elif start == "data":
@@ -219,8 +227,8 @@ def run(
     entropy, shared, *seeds = np.random.SeedSequence(seed).spawn(num_chains + 2)
     latents = first_states(model, evidence, init, num_chains, int(entropy.generate_state(1)[0]))
     keep_from = min(warmup, num_steps - 1)
-    thin = min(thin, num_steps - keep_from)
     chains: Chains
+    climb = None
     if path != "batched" and hasattr(model, "kernel"):
         with announce(f"compiling the sampler for {type(model).__name__}"):
             from inference.compiled_chain import CompiledChains
@@ -228,7 +236,10 @@ def run(
 
             kernel = model.kernel(evidence)
             z = kernel.pack({n: v.numpy() for n, v in latents.items()})
-            chains = CompiledChains(kernel, z, RULES[acceptance], thin, keep_from, seeds, num_workers)
+            compiled = CompiledChains(kernel, z, RULES[acceptance], thin, keep_from, seeds, num_workers)
+            chains, climb = compiled, compiled.polish
+            if polish and kernel.refit is None:
+                raise InputError("polish=true needs a kernel with edits and a refit, but this model's has none")
             if polish:
                 compiled_climb()  # now, so that it is not timed with the chains
     else:
@@ -244,11 +255,12 @@ def run(
             last = first + len(part)
             if resample and last < warmup:
                 heat = 1.0 / ladder[min(last + BLOCK, num_steps) - 1] - 1.0 / part[-1]
-                chains.choose(weights.systematic(heat * chains.log_likelihood, num_chains, rng.random()))
+                tempered = chains.log_joint if acceptance == "paper" else chains.log_likelihood
+                chains.choose(weights.systematic(heat * tempered, num_chains, rng.random()))
             shots.append(_snapshot(chains, last, began))
             bar.advance(len(part))
-    if polish:
-        chains.polish()
+    if polish and climb is not None:
+        climb()
         shots.append(_snapshot(chains, num_steps, began))
     return _posterior(model, chains, draws, shots, time.perf_counter() - began)
 
@@ -289,7 +301,7 @@ def _posterior(model: Any, chains: Chains, draws: list[Any], shots: list[Any], s
         info={
             "engine": "rjmcmc",
             "seconds": seconds,
-            "evaluations": int(counts[:, EVALUATED].sum()),
+            "evaluations": int(counts[:, EVALUATED].sum()),  # of the chains, the greedy search not counted
             "invalid_share": float(1 - counts[:, EVALUATED].sum() / counts[:, TRIED].sum()),
             "acceptance": acceptance,
             "log_joint": chains.best()[1],

@@ -167,9 +167,9 @@ def split(evidence: JunctionEvidence, centre: Array, margin: int) -> Iterator[tu
 
     The centre is rounded to a 2 m grid, closest is meant along the smoothed track."""
     assert evidence.whole is not None
-    points, phi, offsets = evidence.whole.points, np.asarray(evidence.whole.heading), evidence.whole.offsets
+    points, phi, offsets = evidence.whole.rows[:2].T, evidence.whole.rows[2], evidence.whole.offsets
     grid = np.clip(2.0 * np.rint(centre / 2.0), -16.0, 16.0)
-    path = smooth(points, offsets)
+    path = smooth(np.ascontiguousarray(points), offsets)
     for side in (1, -1):
         for t in range(len(offsets) - 1):
             rows = np.arange(offsets[t], offsets[t + 1])

@@ -38,6 +38,7 @@ from models.intersection.moments import (
     X,
     Y,
 )
+from models.intersection.wrap import wrap
 
 EXACT, HALF, POINT = 0, 1, 2
 LIKELIHOODS = {"exact": EXACT, "half": HALF, "point": POINT}
@@ -73,7 +74,7 @@ def mean_row(coef, first, last, side, cx, cy, arm, scatter, row):  # type: ignor
     along = dx * cx + dy * cy
     inner = 0.5 * gap + 0.5 * width
     heading = angle + (math.pi if side > 0 else 0.0) - 0.5 * CHORD * bend
-    top, per_width, turn = num - 1.0, 1.0 / width, 1.0 / (2.0 * math.pi)
+    top, per_width = num - 1.0, 1.0 / width
     for h in range(first, last):
         across = -dy * coef[X, h] + dx * coef[Y, h] - axis - bend * coef[T, h]
         e = side * across - inner
@@ -81,7 +82,7 @@ def mean_row(coef, first, last, side, cx, cy, arm, scatter, row):  # type: ignor
         r = e - k * width
         v = dx * coef[X, h] + dy * coef[Y, h] - along - coef[S, h]
         p = coef[PHI, h] - heading - bend * coef[S, h]
-        p -= 2.0 * math.pi * math.floor(p * turn + 0.5)
+        p = wrap(p)
         mean = coef[W_ACROSS, h] * r * r + coef[W_ALONG, h] * v * v + coef[W_HEADING, h] * p * p
         row[0, h] = scatter[h] + 0.5 * mean
         row[1, h], row[2, h] = k, r
@@ -223,7 +224,7 @@ def closest_points(points, begin, end, first, last, side, cx, cy, arms, num_arms
                 k = min(max(math.floor(e / width + 0.5), 0.0), num - 1.0)
                 r = (e - k * width) / noise[0]
                 p = points[2, i] - angle - (math.pi if side > 0 else 0.0)
-                p = (p - 2.0 * math.pi * math.floor(p / (2.0 * math.pi) + 0.5)) / noise[1]
+                p = wrap(p) / noise[1]
                 cost = 0.5 * (r * r + p * p)
                 if cost < low:
                     low, arm, lane = cost, a, int(k)

@@ -23,6 +23,7 @@ from models.intersection.moments import (
     log_normaliser,
     moments,
 )
+from models.intersection.split import prefix_sums, split_table
 from models.intersection.tracks import Tracks
 from models.program import InputError
 
@@ -31,6 +32,21 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 MIN_POINTS = 8  # of a half track
+
+
+class WholeTracks(NamedTuple):
+    """Tracks that a latent centre splits, see models.intersection.split.
+
+    rows     (3, N) x, y about the origin [m], heading [rad]
+    offsets  (T + 1,) of the tracks
+    sums     running sums along each track
+    table    where each cell of the centre splits each track
+    """
+
+    rows: Array
+    offsets: NDArray[np.int64]
+    sums: Array
+    table: NDArray[np.int64]
 
 
 class JunctionEvidence(NamedTuple):
@@ -51,7 +67,7 @@ class JunctionEvidence(NamedTuple):
     num_entries: int
     origin: Array
     heading: bool
-    whole: Tracks | None
+    whole: WholeTracks | None
 
     @property
     def num_halves(self) -> int:
@@ -65,19 +81,43 @@ class JunctionEvidence(NamedTuple):
         return np.asarray(moments(x, y, phi, self.s, self.starts))
 
 
+def checked(tracks: Tracks) -> tuple[Array, Array | None, NDArray[np.int64]]:
+    """Points, headings and offsets as machine code may read them. Raises InputError: it would not check bounds."""
+    points = np.ascontiguousarray(tracks.points, dtype=np.float64)
+    offsets = np.ascontiguousarray(tracks.offsets, dtype=np.int64)
+    heading = None if tracks.heading is None else np.ascontiguousarray(tracks.heading, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise InputError(f"tracks need points of shape (N, 2), but these are {points.shape}")
+    if len(offsets) < 2 or offsets[0] != 0 or offsets[-1] != len(points) or (np.diff(offsets) < 0).any():
+        raise InputError(f"the offsets of tracks must rise from 0 to their {len(points)} points, but are {offsets}")
+    if heading is not None and heading.shape != (len(points),):
+        raise InputError(f"tracks need one heading a point, {len(points)}, but have {heading.shape}")
+    for name, values in (("points", points), ("headings", heading)):
+        if values is not None and not np.isfinite(values).all():
+            row = int(np.argwhere(~np.isfinite(values))[0, 0])
+            track = int(np.searchsorted(offsets, row, side="right")) - 1
+            raise InputError(f"the {name} of track {track} are not finite at its point {row - offsets[track]}")
+    if heading is not None and np.abs(heading).max() > 1e4:
+        raise InputError(f"headings must be radians, but reach {np.abs(heading).max():g}")
+    return points, heading, offsets
+
+
+def whole_tracks(points: Array, phi: Array, offsets: NDArray[np.int64], path: Array) -> WholeTracks:
+    """Tables of tracks about the origin for likelihoods that split them at the latent centre."""
+    rows = np.ascontiguousarray(np.vstack([points.T, phi]))
+    return WholeTracks(rows, offsets, prefix_sums(rows, offsets), split_table(np.ascontiguousarray(path), offsets))
+
+
 def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
     """Split tracks into halves outside the inner radius about where they meet.
 
     Raises InputError where no track is long enough or none crosses."""
-    offsets = np.ascontiguousarray(tracks.offsets, dtype=np.int64)
-    points = np.ascontiguousarray(tracks.points, dtype=np.float64)
-    if len(offsets) < 2 or not np.isfinite(points).all():
-        raise InputError(f"tracks must be finite points of at least one vehicle; got {len(offsets) - 1} vehicles")
+    points, heading, offsets = checked(tracks)
     path = hv.smooth(points, offsets)
     origin = hv.crossing(path, offsets)
-    measured = tracks.heading is not None
+    measured = heading is not None
     turn = hv.path_headings(path, offsets)
-    phi = hv.unwrap(np.asarray(tracks.heading), offsets) if measured else turn
+    phi = turn if heading is None else hv.unwrap(heading, offsets)
     begin, end, entries = hv.outer_halves(path, turn, offsets, origin, model.inner_radius, MIN_POINTS)
     if len(begin) == 0:
         raise InputError(
@@ -86,7 +126,7 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
             f"{hv.LEAST_RADIUS:g} m from it; give tracks that cross the junction"
         )
     observed, s, starts = hv.gather_halves(points, path, phi, begin, end, entries, origin)
-    whole = Tracks(points - origin, phi, offsets) if model.likelihood != "exact" else None
+    whole = None if model.likelihood == "exact" else whole_tracks(points - origin, phi, offsets, path - origin)
     return JunctionEvidence(torch.from_numpy(observed), s, starts, int(entries), origin, measured, whole)
 
 

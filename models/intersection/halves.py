@@ -7,12 +7,15 @@ import math
 import numba as nb
 import numpy as np
 
+from models.intersection.wrap import wrap
+
 SMOOTHING = 4  # points on either side
 END = 24  # points at a track's end that show an arm's direction
 TURN = 0.25  # change of direction that ends an arm [rad]
 MARGIN = 4  # points left out before a turn
 ENOUGH = 30.0  # [m] of a half track
 CROSSES = 40.0  # [m] from the crossing: a track that stays farther away is none of its vehicles
+LEAST_EXTENT = 4.0  # [m] from end to end: a standing vehicle shows no direction
 LEAST_RADIUS = 12.0  # [m] inside which no point is on an arm
 
 
@@ -42,15 +45,9 @@ def path_headings(path, offsets):  # type: ignore[no-untyped-def]
         for i in range(first, last):
             low, high = max(first, i - SMOOTHING), min(last - 1, i + SMOOTHING)
             angle = math.atan2(path[high, 1] - path[low, 1], path[high, 0] - path[low, 0])
-            before = angle if i == first else before + unwrap_step(angle - before)
+            before = angle if i == first else before + wrap(angle - before)
             out[i] = before
     return out
-
-
-@nb.njit(cache=True)
-def unwrap_step(angle):  # type: ignore[no-untyped-def]
-    """An angle in [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)
 
 
 @nb.njit(cache=True)
@@ -59,7 +56,7 @@ def unwrap(heading, offsets):  # type: ignore[no-untyped-def]
     out = heading.copy()
     for t in range(len(offsets) - 1):
         for i in range(offsets[t] + 1, offsets[t + 1]):
-            out[i] = out[i - 1] + unwrap_step(heading[i] - out[i - 1])
+            out[i] = out[i - 1] + wrap(heading[i] - out[i - 1])
     return out
 
 
@@ -124,7 +121,7 @@ def straight_end(turn, outer, inner, margin):  # type: ignore[no-untyped-def]
         mean += turn[outer + step * j] / third
     run = 0
     for j in range(abs(inner - outer)):
-        run = run + 1 if abs(unwrap_step(turn[outer + step * j] - mean)) > TURN else 0
+        run = run + 1 if abs(wrap(turn[outer + step * j] - mean)) > TURN else 0
         if run == 3:
             return outer + step * max(j - 2 - margin, 0)
     return inner
@@ -158,7 +155,8 @@ def outer_halves(path, turn, offsets, centre, inner_radius, min_points):  # type
                 high = straight_end(turn, low, high, MARGIN)
             else:
                 low = straight_end(turn, high - 1, low, MARGIN)
-            if high - low >= min_points:
+            extent = math.hypot(path[high - 1, 0] - path[low, 0], path[high - 1, 1] - path[low, 1])
+            if high - low >= min_points and extent > LEAST_EXTENT:
                 begin[count], end[count] = low, high
                 count += 1
         if side == 0:

@@ -20,7 +20,6 @@ from models.intersection import density, moves
 from models.intersection.borrow import borrow
 from models.intersection.density import EXACT, HALF, LIKELIHOODS, POINT
 from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
-from models.intersection.halves import smooth
 from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS, W_ACROSS
 from models.intersection.packing import ARM, ENTRIES, HEAD, MAX_ARMS, SIZE, pack, unpack
 from models.intersection.prior import GAP_MAX, log_prior, prior_numbers
@@ -31,8 +30,6 @@ from models.intersection.split import (
     cell_coefficients,
     cell_of,
     half_ranges,
-    prefix_sums,
-    split_table,
 )
 
 if TYPE_CHECKING:
@@ -259,12 +256,10 @@ def bound_data(model: Junction, evidence: JunctionEvidence, observed: Array) -> 
         floats = np.concatenate([head, scaled(evidence, observed, model).ravel(), stray])
         return floats, np.array([kind, evidence.num_halves, evidence.num_entries, 0, 0], dtype=np.int64)
     assert evidence.whole is not None
-    points, phi, offsets = evidence.whole.points, evidence.whole.heading, evidence.whole.offsets
-    rows = np.ascontiguousarray(np.vstack([points.T, np.asarray(phi)]))
+    rows, offsets, sums, table = evidence.whole
     num, margin = len(offsets) - 1, int(model.inner_radius)
     head = [*settings(model), *log_share, model.position_std, heading, 0.0]
-    floats = np.concatenate([head, rows.ravel(), prefix_sums(rows, offsets).ravel()])
-    table = split_table(np.ascontiguousarray(smooth(points, offsets)), offsets)
+    floats = np.concatenate([head, rows.ravel(), sums.ravel()])
     return floats, np.concatenate([[kind, 2 * num, num, num, margin], offsets, table]).astype(np.int64)
 
 
@@ -297,19 +292,6 @@ def move_table(model: Junction) -> dict[int, float]:
     return moves.probabilities(model.steps, {name: name not in model.constants for name in ("width", "bend", "shift")})
 
 
-@lru_cache(maxsize=1)
-def _propose_rows() -> Any:
-    """`propose` over rows of states; compiled once."""
-    propose = compiled()["propose"]
-
-    @nb.njit
-    def rows(kind, z, u, floats, ints, z_new, u_new, log_q, valid):  # type: ignore[no-untyped-def]
-        for b in range(len(z)):
-            valid[b] = propose(kind, z[b], u[b], floats, ints, z_new[b], u_new[b], log_q[b])
-
-    return rows
-
-
 def batched_moves(model: Junction) -> tuple[Move, ...]:
     """The compiled involutions as moves over batches of latents."""
     numbers, none = settings(model), np.zeros(1, dtype=np.int64)
@@ -319,7 +301,9 @@ def batched_moves(model: Junction) -> tuple[Move, ...]:
         z = pack(latents, constants, origin)
         z_new, u_new, log_q = np.empty_like(z), np.empty(u.shape), np.empty((len(z), 3))
         valid = np.empty(len(z), dtype=np.bool_)
-        _propose_rows()(kind, z, np.ascontiguousarray(u.numpy()), numbers, none, z_new, u_new, log_q, valid)
+        propose, numbers_in = compiled()["propose"], np.ascontiguousarray(u.numpy())
+        for b in range(len(z)):
+            valid[b] = propose(kind, z[b], numbers_in[b], numbers, none, z_new[b], u_new[b], log_q[b])
         new = {name: torch.from_numpy(np.array(value)) for name, value in unpack(z_new, constants, origin).items()}
         forward, backward, jacobian = torch.from_numpy(log_q).unbind(-1)
         return Proposal(new, torch.from_numpy(u_new), forward, backward, jacobian, torch.from_numpy(valid))

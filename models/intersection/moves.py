@@ -36,6 +36,7 @@ from models.intersection.prior import (
     lanes_fit,
     log_slot,
 )
+from models.intersection.wrap import wrap
 
 ROTATE, CENTRE, CHANGE_GAP, ARMS, LANES, TOGGLE, SCALE_WIDTH, CHANGE_BEND, CHANGE_SHIFT, PIVOT = range(10)
 NAMES = ("rotate", "centre", "gap", "arms", "lanes", "toggle", "width", "bend", "shift", "pivot")
@@ -64,12 +65,6 @@ def step_scale(u, settings):  # type: ignore[no-untyped-def]
     if settings[SMALL_STEPS] == 0.0 or u < 0.3:
         return 1.0
     return math.exp(-3.5 * (u - 0.3) / 0.7)
-
-
-@nb.njit(cache=True)
-def wrap(angle):  # type: ignore[no-untyped-def]
-    """An angle in [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)
 
 
 @nb.njit(cache=True)

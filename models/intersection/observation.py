@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import numba as nb
 import numpy as np
 import torch
 from pyro.distributions import TorchDistribution
@@ -17,21 +15,10 @@ from models.intersection.evidence import JunctionEvidence
 from models.intersection.kernel import bound_data, compiled, memory_size
 from models.intersection.moments import CHORD
 from models.intersection.packing import MAX_ARMS, pack
+from models.program import InputError
 
 if TYPE_CHECKING:
     from models.intersection.state import Junction
-
-
-@lru_cache(maxsize=1)
-def _likelihood_rows() -> Any:
-    evaluate = compiled()["evaluate"]
-
-    @nb.njit
-    def rows(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
-        for b in range(len(z)):
-            evaluate(z[b], floats, ints, cache, out[b])
-
-    return rows
 
 
 class TracksOnLanes(TorchDistribution):
@@ -48,8 +35,10 @@ class TracksOnLanes(TorchDistribution):
         self, model: Junction, evidence: JunctionEvidence, num_arms: Tensor, centre: Tensor, arms: dict[str, Tensor]
     ) -> None:
         self.model, self.evidence = model, evidence
-        self.latents = {"num_arms": num_arms, "centre": centre, **arms}
-        super().__init__(num_arms.shape, torch.Size([3, len(evidence.s)]), validate_args=False)
+        batch = torch.broadcast_shapes(num_arms.shape, centre.shape[:-1], *(v.shape[:-1] for v in arms.values()))
+        wide = {"centre": centre.expand(*batch, 2), **{n: v.expand(*batch, MAX_ARMS) for n, v in arms.items()}}
+        self.latents = {"num_arms": num_arms.expand(batch), **wide}
+        super().__init__(batch, torch.Size([3, len(evidence.s)]), validate_args=False)
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> TracksOnLanes:
         own = len(self.batch_shape)
@@ -67,13 +56,18 @@ class TracksOnLanes(TorchDistribution):
         return pack(flat, self.model.constants, self.evidence.origin)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        z = self._packed()
+        if self.model.likelihood != "exact" and value is not self.evidence.points:
+            raise InputError(
+                f"likelihood '{self.model.likelihood}' scores the tracks that its evidence was prepared from; "
+                "prepare() other tracks, or use likelihood=exact"
+            )
+        z, evaluate = self._packed(), compiled()["evaluate"]
         out, points = np.empty((len(z), 2)), value.reshape(value.shape[:-2].numel(), 3, value.shape[-1])
         for b, observed in enumerate(points):
-            rows = z if len(points) == 1 else z[b : b + 1]
             floats, ints = bound_data(self.model, self.evidence, self.evidence._replace(points=observed).moments)
-            cache = np.full(int(memory_size(ints)), 0.0)
-            _likelihood_rows()(rows, floats, ints, cache, out if len(points) == 1 else out[b : b + 1])
+            cache = np.zeros(int(memory_size(ints)))
+            for row in range(len(z)) if len(points) == 1 else (b,):
+                evaluate(z[row], floats, ints, cache, out[row])
         shape = torch.broadcast_shapes(self.batch_shape, value.shape[:-2])
         return torch.from_numpy(out[:, 1].copy()).reshape(shape)
 

@@ -25,7 +25,8 @@ WHOLE = ("entries", "exits")
 
 
 def pack(latents: dict[str, Any], constants: dict[str, float], origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """{site: (B, *event)} to (B, SIZE); sites the program does not have come from `constants`."""
+    """{site: (B, *event)} to (B, SIZE); sites the program does not have come from `constants`; angles are
+    brought to [-pi, pi)."""
     num = np.asarray(latents["num_arms"], dtype=np.float64).reshape(-1)
     z = np.empty((len(num), SIZE))
     z[:, 0] = num
@@ -33,6 +34,8 @@ def pack(latents: dict[str, Any], constants: dict[str, float], origin: NDArray[n
     slots = z[:, HEAD:].reshape(len(num), MAX_ARMS, ARM)
     for j, name in enumerate(FIELDS):
         slots[:, :, j] = np.asarray(latents[name]) if name in latents else constants[name]
+    turned = np.abs(slots[:, :, ANGLE]) > np.pi
+    slots[turned, ANGLE] = np.remainder(slots[turned, ANGLE] + np.pi, 2 * np.pi) - np.pi
     return z
 
 

@@ -8,6 +8,7 @@ import numba as nb
 
 from models.intersection.angles import MIN_SEPARATION
 from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, MAX_ARMS, MIN_ARMS, SHIFT, WIDTH
+from models.intersection.wrap import wrap
 
 # the prior's numbers, at the head of the kernel's floats: settings, then logarithms made once from them
 CENTRE_STD, GAP_MAX, LOG_WIDTH, WIDTH_SPREAD, BEND_STD, SHIFT_STD, MIN_LANES, MAX_LANES = range(8)
@@ -59,9 +60,7 @@ def apart(z, num, angle, skip):  # type: ignore[no-untyped-def]
     """Whether an angle keeps its distance from the active arms other than `skip`."""
     for a in range(num):
         if a != skip:
-            gap = angle - z[HEAD + a * ARM + ANGLE]
-            gap -= 2.0 * math.pi * math.floor(gap / (2.0 * math.pi) + 0.5)
-            if abs(gap) < MIN_SEPARATION:
+            if abs(wrap(angle - z[HEAD + a * ARM + ANGLE])) < MIN_SEPARATION:
                 return False
     return True
 

@@ -18,10 +18,9 @@ import numpy as np
 
 from models.intersection import moments as mo
 from models.intersection.density import NO_LANE
-from models.intersection.halves import unwrap_step
 from models.intersection.moments import CHORD
 from models.intersection.moves import LEVER
-from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, MAX_ARMS, SHIFT, WIDTH
+from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, SHIFT, WIDTH
 from models.intersection.prior import (
     BEND_STD,
     CENTRE_STD,
@@ -31,11 +30,12 @@ from models.intersection.prior import (
     WIDTH_SPREAD,
     lanes_fit,
 )
+from models.intersection.wrap import wrap
 
 FREE = 5  # continuous numbers of an arm
 FREE_FIELDS = np.array([ANGLE, GAP, WIDTH, BEND, SHIFT])
+LEAST_WIDTH = 0.5  # [m]
 FARTHEST = np.array([0.1, 1.5, 0.5, 0.005, 1.0])  # largest step of each
-SYSTEM = 2 + FREE * MAX_ARMS
 
 # (entries, exits, gap in widths, axis in widths, keep the span) of the edits of an arm: outer lanes, inner lanes,
 # lanes that change sides, and lanes that share the width that the side had before
@@ -82,7 +82,7 @@ def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
     if abs(axis) < 2.0 * floats[SHIFT_STD]:
         z_new[o + SHIFT] += axis
     else:
-        z_new[o + ANGLE] = unwrap_step(z[o + ANGLE] + axis / LEVER)
+        z_new[o + ANGLE] = wrap(z[o + ANGLE] + axis / LEVER)
     return lanes_fit(z_new[o + ENTRIES], z_new[o + EXITS], floats)
 
 
@@ -118,7 +118,7 @@ def add_half(coef, h, side, lane, z, arm, dx, dy, hessian, gradient, where, slop
         turn = coef[mo.PHI, h] - z[o + ANGLE] - (math.pi if side > 0 else 0.0) - bend * (coef[mo.S, h] - 0.5 * CHORD)
         slopes[2], slopes[5] = -1.0, -(coef[mo.S, h] - 0.5 * CHORD)
         slopes[3] = slopes[4] = 0.0
-        add_square(hessian, gradient, where[2:6], slopes[2:6], unwrap_step(turn), coef[mo.W_HEADING, h])
+        add_square(hessian, gradient, where[2:6], slopes[2:6], wrap(turn), coef[mo.W_HEADING, h])
     a, b = first, first + 3  # scatter: angle and bend
     twist = dx * coef[mo.A_KY, h] + dy * coef[mo.A_KX, h]
     gradient[a] += 2 * dx * dy * (coef[mo.A_YY, h] - coef[mo.A_XX, h]) + (dx * dx - dy * dy) * coef[mo.A_XY, h]
@@ -133,7 +133,7 @@ def add_half(coef, h, side, lane, z, arm, dx, dy, hessian, gradient, where, slop
 
 @nb.njit(cache=True, error_model="numpy")
 def add_prior(z, floats, hessian, gradient):  # type: ignore[no-untyped-def]
-    """Add the negative log prior of the continuous numbers; constants get a wall."""
+    """Add the negative log prior of the continuous numbers; the row of a constant becomes that of the identity."""
     for j in range(2):
         hessian[j, j] += 1.0 / floats[CENTRE_STD] ** 2
         gradient[j] += z[1 + j] / floats[CENTRE_STD] ** 2
@@ -142,13 +142,25 @@ def add_prior(z, floats, hessian, gradient):  # type: ignore[no-untyped-def]
         hessian[first, first] += 1e-2
         hessian[first + 1, first + 1] += 1e-2
         width, spread = z[o + WIDTH], floats[WIDTH_SPREAD]
-        hessian[first + 2, first + 2] += 1.0 / (width * spread) ** 2 if spread > 0.0 else 1e12
         if spread > 0.0:
+            hessian[first + 2, first + 2] += 1.0 / (width * spread) ** 2
             gradient[first + 2] += ((math.log(width) - floats[LOG_WIDTH]) / spread**2 + 1.0) / width
+        else:
+            hold(hessian, gradient, first + 2)
         for j, field, std in ((3, BEND, floats[BEND_STD]), (4, SHIFT, floats[SHIFT_STD])):
-            hessian[first + j, first + j] += 1.0 / std**2 if std > 0.0 else 1e12
             if std > 0.0:
+                hessian[first + j, first + j] += 1.0 / std**2
                 gradient[first + j] += z[o + field] / std**2
+            else:
+                hold(hessian, gradient, first + j)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def hold(hessian, gradient, i):  # type: ignore[no-untyped-def]
+    """Take an unknown out of the system: its step is zero."""
+    hessian[i, :i] = 0.0
+    hessian[i + 1 :, i] = 0.0
+    hessian[i, i], gradient[i] = 1.0, 0.0
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -209,6 +221,6 @@ def take_step(z, step, gap_max):  # type: ignore[no-untyped-def]
             i = HEAD + a * ARM + FREE_FIELDS[j]
             z[i] -= min(max(step[2 + FREE * a + j], -FARTHEST[j]), FARTHEST[j])
         o = HEAD + a * ARM
-        z[o + ANGLE] = unwrap_step(z[o + ANGLE])
+        z[o + ANGLE] = wrap(z[o + ANGLE])
         z[o + GAP] = min(max(z[o + GAP], 0.0), gap_max)
-        z[o + WIDTH] = max(z[o + WIDTH], 1.0)
+        z[o + WIDTH] = max(z[o + WIDTH], LEAST_WIDTH) if step[4 + FREE * a] != 0.0 else z[o + WIDTH]

@@ -14,10 +14,10 @@ import torch
 
 from models.intersection.angles import MIN_SEPARATION
 from models.intersection.evidence import JunctionEvidence
-from models.intersection.halves import unwrap_step
 from models.intersection.moments import CXS, CYS, MX, MY
 from models.intersection.moves import insertion_sort
 from models.intersection.packing import ANGLE, ARM, ENTRIES, EXITS, GAP, HEAD, MAX_ARMS, MIN_ARMS, SIZE, WIDTH, unpack
+from models.intersection.wrap import wrap
 from models.program import InputError
 
 if TYPE_CHECKING:
@@ -40,20 +40,20 @@ def group_directions(directions, angles):  # type: ignore[no-untyped-def]
                 continue
             near = 0
             for j in range(len(directions)):
-                near += 1 if left[j] and abs(unwrap_step(directions[j] - directions[i])) < GROUP else 0
+                near += 1 if left[j] and abs(wrap(directions[j] - directions[i])) < GROUP else 0
             if near > most:
                 most, seed = near, i
         turn = 0.0
         for j in range(len(directions)):
-            gap = unwrap_step(directions[j] - directions[seed])
+            gap = wrap(directions[j] - directions[seed])
             if left[j] and abs(gap) < GROUP:
                 turn += gap
-        angle = unwrap_step(directions[seed] + turn / most)
+        angle = wrap(directions[seed] + turn / most)
         for j in range(len(directions)):
-            left[j] = left[j] and abs(unwrap_step(directions[j] - angle)) >= TAKEN and j != seed
+            left[j] = left[j] and abs(wrap(directions[j] - angle)) >= TAKEN and j != seed
         apart = True
         for a in range(num):
-            apart = apart and abs(unwrap_step(angle - angles[a])) >= MIN_SEPARATION
+            apart = apart and abs(wrap(angle - angles[a])) >= MIN_SEPARATION
         if apart and most >= SMALLEST:
             angles[num] = angle
             num += 1
@@ -78,20 +78,21 @@ def fill_arms(z, num, mean, directions, entries, width, max_lanes, gap_max, one_
             offsets = np.empty(mean.shape[1])
             count = 0
             for h in range(mean.shape[1]):
-                if (h < entries) != (side == 0) or abs(unwrap_step(directions[h] - angle)) >= TAKEN:
+                if (h < entries) != (side == 0) or abs(wrap(directions[h] - angle)) >= TAKEN:
                     continue
                 across = -math.sin(angle) * mean[0, h] + math.cos(angle) * mean[1, h]
                 offsets[count] = across if side == 0 else -across
                 count += 1
             if count == 0:
                 z[o + ENTRIES + side] = 0.0 if one_way else 1.0
-                edges[side] = -1.0
+                edges[side] = np.nan
                 continue
             insertion_sort(offsets[:count])
             edges[side], z[o + ENTRIES + side] = lane_range(offsets[:count], width, max_lanes)
         if z[o + ENTRIES] + z[o + EXITS] < 0.5:
             z[o + ENTRIES] = 1.0
-        both = edges[0] + edges[1] if edges[0] > -1.0 and edges[1] > -1.0 else 2.0 * max(edges[0], edges[1])
+        known = edges[~np.isnan(edges)]  # inner edges of the sides that were driven
+        both = 2.0 * known.mean() if len(known) > 0 else 0.0
         z[o + GAP] = min(max(both, 0.05 * gap_max), 0.95 * gap_max)
 
 
@@ -126,9 +127,11 @@ def start_from_halves(model: Junction, evidence: JunctionEvidence) -> dict[str, 
 
 
 def m20_start(model: Junction, evidence: JunctionEvidence) -> dict[str, Any]:
-    """{site: (*event)}: the mean of the points, three arms 120 degrees apart, gap 1 m, one lane each way."""
+    """{site: (*event)}: three arms 120 degrees apart, gap 1 m, one lane each way, at the mean of the points.
+
+    With likelihood=exact that is the mean of the points on arms: it knows no others."""
     assert evidence.points is not None
-    points = evidence.points[:2].numpy().T if evidence.whole is None else evidence.whole.points
+    points = evidence.points[:2].numpy().T if evidence.whole is None else evidence.whole.rows[:2].T
     z = np.zeros(SIZE)
     z[0], z[1:HEAD] = 3, points.mean(0)
     slots = z[HEAD:].reshape(MAX_ARMS, ARM)

@@ -39,6 +39,7 @@ class Junction:
     likelihood  'exact' sums over lane labels of half tracks with fixed positions along the lane: a normalised
                 density. 'half' and 'point' are [M20]'s closest lane with multinomial counts, split at the
                 current centre, for each half track or for each point: scores for straight arms, not densities.
+                Where headings were not measured these two take them from the smoothed path, the exact one has none.
     steps       'm20' are the moves of Algorithm 1; 'extended' adds small steps, lane toggles and the moves of
                 width, bend and shift.
     begin       'tracks' starts from the data: arms where half tracks point, lanes where they lie; 'm20' as [M20] might
@@ -68,16 +69,30 @@ class Junction:
     inner_radius: float = 30.0  # points closer to the crossing are on no arm [m]
 
     def __post_init__(self) -> None:
+        words = {"likelihood": ("exact", "half", "point"), "steps": ("extended", "m20"), "begin": ("tracks", "m20")}
+        for name, known in words.items():
+            if getattr(self, name) not in known:
+                raise InputError(f"{name} must be one of {', '.join(known)}, but is '{getattr(self, name)}'")
+        scales = ("gap_max", "centre_std", "width", "position_std", "along_std", "phase_std", "heading_std")
+        for name in (*scales, "clutter_std", "inner_radius"):
+            self._check(name, may_be_zero=False)
+        for name in ("width_spread", "bend_std", "shift_std", "offset_std", "clutter"):
+            self._check(name, may_be_zero=True)
+        if self.clutter >= 1:
+            raise InputError(f"clutter is a share below 1, but is {self.clutter}")
+        if not 1 <= self.max_lanes <= 8:
+            raise InputError(f"max_lanes must be 1 to 8, but is {self.max_lanes}")
         if self.likelihood != "exact" and self.bend_std > 0:
             raise InputError(
                 f"likelihood '{self.likelihood}' knows the straight arms of [M20] only, but bend_std is "
                 f"{self.bend_std}; set bend_std=0 or likelihood=exact"
             )
-        if not 1 <= self.max_lanes <= 8:
-            raise InputError(f"max_lanes must be 1 to 8, but is {self.max_lanes}")
-        for name in ("gap_max", "centre_std", "width", "position_std", "along_std", "phase_std", "heading_std"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} must be positive, but is {getattr(self, name)}")
+
+    def _check(self, name: str, *, may_be_zero: bool) -> None:
+        value = getattr(self, name)
+        if not math.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
+            least = "zero or positive" if may_be_zero else "positive"
+            raise InputError(f"{name} must be finite and {least}, but is {value}")
 
     @property
     def noise(self) -> Noise:

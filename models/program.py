@@ -67,9 +67,13 @@ class _Frozen(Messenger):
     def __init__(self, values: Latents) -> None:
         super().__init__()
         self.values = values
+        self.met: set[str] = set()
 
     def _pyro_sample(self, msg: Any) -> None:
         if msg["name"] in self.values:
+            if _is_evidence(msg):
+                raise InputError(f"fix() freezes latents, but '{msg['name']}' is observed; change it in the evidence")
+            self.met.add(msg["name"])
             value = self.values[msg["name"]]
             if not msg["fn"].support.is_discrete:
                 value = value.double()  # a Normal about an integer rounds its scale to one
@@ -201,14 +205,18 @@ class Fixed:
     values: Latents
 
     def __call__(self, evidence: Any) -> None:
-        with _Frozen(self.values):
+        with _Frozen(self.values) as frozen:
             self.model(evidence)
+        missed = self.values.keys() - frozen.met
+        if missed:
+            raise InputError(f"fix() was given {sorted(missed)}, but the program has no site of that name; check it")
 
 
 def fix(model: Model, **values: Tensor | float) -> Fixed:
     """Freeze sites at values; what remains is an ordinary program over the other sites.
 
-    The frozen sites keep contributing their prior density to `log_joint`."""
+    The frozen sites keep contributing their density given the latents to `log_joint`. Running the
+    program raises InputError by name for a value without a site and for one whose site is observed."""
     with quiet_doubles():
         return Fixed(model, {name: torch.as_tensor(value) for name, value in values.items()})
 

@@ -208,6 +208,16 @@ def test_a_fixed_value_keeps_its_digits_and_an_integer_stands_for_a_real() -> No
     assert float(fix(chain, x=0.1).values["x"]) == 0.1
 
 
+def test_fixing_what_is_no_latent_is_refused_by_name() -> None:
+    road, evidence = SlotRoad(), Markings(torch.arange(5.0), torch.zeros(5))
+    with pytest.raises(InputError, match=r"\['num_knot'\], but the program has no site of that name"):
+        bind(fix(road, num_knot=2, knot=torch.full((4,), 10.0)), evidence)
+    with pytest.raises(InputError, match="'d' is observed"):
+        simulate(fix(road, d=torch.ones(5)), evidence, num=1, seed=0)
+    unseen = evidence._replace(d=None)
+    assert "d" not in simulate(fix(road, d=torch.ones(5)), unseen, num=1, seed=0)
+
+
 def test_missing_and_unused_values_are_refused_by_name() -> None:
     with pytest.raises(InputError, match="'low' has no value"):
         log_joint(zoo, {"scale": torch.tensor(1.0)}, SEEN)

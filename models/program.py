@@ -437,6 +437,17 @@ class Bound:
                 scales[name] = scale.detach()
 
 
+def _refuse_weight(name: str, site: Site) -> None:
+    fn, masked = site["fn"], site["mask"] is not None
+    while isinstance(fn, WRAPPERS):
+        masked, fn = masked or isinstance(fn, MaskedDistribution), fn.base_dist
+    if masked or not bool((torch.as_tensor(site["scale"]) == 1).all()):
+        raise InputError(
+            f"whitening needs latents with their whole density, but '{name}' is under a "
+            f"{'mask' if masked else 'scale'} (poutine or a subsampled plate); take it off or fix() the site"
+        )
+
+
 def _settled(bound: Bound, frozen: set[str]) -> frozenset[str]:
     """Those frozen sites whose density depends on no latent: by dependency and by change, as above."""
     still, seen = set(frozen), dict[str, Tensor]()
@@ -452,7 +463,8 @@ def _settled(bound: Bound, frozen: set[str]) -> frozenset[str]:
 def bind(model: Model, evidence: Any) -> Bound:
     """Bind a model to its evidence as a flat whitened density.
 
-    Raises InputError by name for a latent that no map of normal numbers reaches."""
+    Raises InputError by name for a latent that no map of normal numbers reaches, and for one under
+    a scale or a mask: its density is then not that of the numbers."""
     with torch.random.fork_rng(devices=[]), quiet_doubles():
         torch.manual_seed(0)
         sites = _sample_sites(model, evidence)
@@ -460,6 +472,7 @@ def bind(model: Model, evidence: Any) -> Bound:
     for name, site in sites.items():
         if not site["is_observed"]:
             _to_standard(name, site["fn"], site["value"])
+            _refuse_weight(name, site)
             shapes[name] = site["value"].shape
             pads[name] = plate_dims - (site["value"].dim() - site["fn"].event_dim)
     bound = Bound(model, evidence, shapes, pads)

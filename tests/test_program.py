@@ -218,6 +218,32 @@ def test_fixing_what_is_no_latent_is_refused_by_name() -> None:
     assert "d" not in simulate(fix(road, d=torch.ones(5)), unseen, num=1, seed=0)
 
 
+@pytest.mark.parametrize(
+    ("weigh", "word"),
+    [
+        (lambda: poutine.scale(scale=2.0), "scale"),
+        (lambda: poutine.scale(scale=torch.tensor(0.5)), "scale"),
+        (lambda: poutine.mask(mask=torch.tensor(False)), "mask"),
+    ],
+)
+def test_a_scale_or_a_mask_on_a_latent_is_refused_by_name(weigh, word: str) -> None:
+    def weighted(evidence: Observed) -> None:
+        with weigh():
+            level = pyro.sample("level", dist.Normal(0.0, 1.0))
+        pyro.sample("y", dist.Normal(level[..., None].expand(*level.shape, 3), 0.5).to_event(1), obs=evidence.y)
+
+    with pytest.raises(InputError, match=f"'level' is under a {word}"):
+        bind(weighted, SEEN)
+
+
+def test_a_masked_distribution_of_a_latent_is_refused_by_name() -> None:
+    def masked(evidence: Observed) -> None:
+        pyro.sample("pair", dist.Normal(torch.zeros(2), 1.0).mask(torch.tensor([True, False])).to_event(1))
+
+    with pytest.raises(InputError, match="'pair' is under a mask"):
+        bind(masked, SEEN)
+
+
 def test_missing_and_unused_values_are_refused_by_name() -> None:
     with pytest.raises(InputError, match="'low' has no value"):
         log_joint(zoo, {"scale": torch.tensor(1.0)}, SEEN)

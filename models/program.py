@@ -10,6 +10,7 @@ observed site carries the name of the field that observes it.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -94,16 +95,23 @@ class _Whitened(Messenger):
             msg["value"], msg["done"] = _from_standard(msg["name"], msg["fn"], number), True
 
 
+_PROGRAMS = threading.RLock()
+
+
 @contextmanager
 def quiet_doubles() -> Iterator[None]:
-    """Run a program in float64, without Pyro's own validation, leaving no trace of either."""
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    try:
-        with pyro.validation_enabled(False):
-            yield
-    finally:
-        torch.set_default_dtype(before)
+    """Run a program in float64, without Pyro's own validation, leaving no trace of either.
+
+    Both settings, Pyro's handlers and torch's random numbers belong to the whole process: one
+    thread runs programs at a time, and seeds inside this context."""
+    with _PROGRAMS:
+        before = torch.get_default_dtype()
+        torch.set_default_dtype(torch.float64)
+        try:
+            with pyro.validation_enabled(False):
+                yield
+        finally:
+            torch.set_default_dtype(before)
 
 
 def _sample_sites(model: Model, evidence: Any) -> dict[str, Site]:
@@ -126,7 +134,7 @@ def _is_evidence(site: Site) -> bool:
 
 
 def _log_prob(site: Site) -> Tensor:
-    with pyro.validation_enabled(False):
+    with quiet_doubles():
         return site["fn"].log_prob(site["value"])
 
 
@@ -183,7 +191,7 @@ def simulate(model: Model, evidence: Any, *, num: int, seed: int) -> Latents:
     """Draw every unobserved site `num` times from the program, {site: (num, *event)}.
 
     Sites whose evidence field is None are drawn too. Randomness is local to the call."""
-    with torch.random.fork_rng(devices=[]), quiet_doubles():
+    with quiet_doubles(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         plates = _plate_dims(_sample_sites(model, evidence))
         with pyro.plate("_batch", num, dim=-1 - plates):
@@ -465,7 +473,7 @@ def bind(model: Model, evidence: Any) -> Bound:
 
     Raises InputError by name for a latent that no map of normal numbers reaches, and for one under
     a scale or a mask: its density is then not that of the numbers."""
-    with torch.random.fork_rng(devices=[]), quiet_doubles():
+    with quiet_doubles(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         sites = _sample_sites(model, evidence)
     shapes, pads, plate_dims = {}, {}, _plate_dims(sites)

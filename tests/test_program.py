@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import pyro
@@ -305,6 +307,27 @@ def test_simulation_is_local_to_its_seed_and_leaves_global_randomness_alone() ->
     other = simulate(SlotRoad(), Markings(torch.arange(5.0), None), num=4, seed=2)
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not torch.equal(first["d0"], other["d0"])
+    assert torch.get_default_dtype() == torch.float32
+
+
+def test_threads_run_programs_as_one_thread_would() -> None:
+    """Threads switch after every few instructions, so that runs overlap wherever they can."""
+    blank = Markings(torch.arange(5.0, dtype=torch.float64), None)
+
+    def height(seed: int) -> Tensor:
+        evidence, latents = observe(blank, simulate(SlotRoad(), blank, num=3, seed=seed))
+        return log_joint(SlotRoad(), latents, evidence)
+
+    alone = [height(seed) for seed in range(24)]
+    state, pause = torch.get_rng_state(), sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            together = list(pool.map(height, range(24)))
+    finally:
+        sys.setswitchinterval(pause)
+    assert all(torch.equal(a, b) for a, b in zip(alone, together, strict=True))
+    assert torch.equal(torch.get_rng_state(), state)
     assert torch.get_default_dtype() == torch.float32
 
 

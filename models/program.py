@@ -116,7 +116,12 @@ def quiet_doubles() -> Iterator[None]:
 
 def _sample_sites(model: Model, evidence: Any) -> dict[str, Site]:
     nodes: dict[str, Any] = dict(poutine.trace(model).get_trace(evidence).nodes)
-    return {n: site for n, site in nodes.items() if site["type"] == "sample" and not site_is_subsample(site)}
+    return {n: site for n, site in nodes.items() if site["type"] == "sample" and not _is_bookkeeping(site)}
+
+
+def _is_bookkeeping(site: Site) -> bool:
+    """Of a plate, or a name for a computed value (pyro.deterministic): no random variable."""
+    return bool(site_is_subsample(site) or site["infer"].get("_deterministic", False))
 
 
 def _sites(model: Model, evidence: Any, handler: Messenger) -> dict[str, Site]:

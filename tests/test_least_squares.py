@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from inference import least_squares
-from models.program import InputError, bind, fix, observe, quiet_doubles, simulate
+from models.program import InputError, bind, check, fix, observe, quiet_doubles, simulate
 from models.toys.gaussian import ConjugateGaussian, Readings
 from models.toys.slot_road import Markings, SlotRoad, offset
 
@@ -196,6 +196,19 @@ def test_plates_are_read_and_draws_keep_their_shape() -> None:
     assert float(posterior.estimate["common"]) == pytest.approx(float(common), abs=1e-8)
     exact = dist.MultivariateNormal(torch.zeros(3, dtype=torch.float64), spread).log_prob(seen.y)
     assert posterior.log_evidence == pytest.approx(float(exact), abs=1e-8)
+
+
+def test_a_named_computed_value_changes_nothing() -> None:
+    def named(evidence: Signal) -> None:
+        omega = pyro.sample("omega", dist.Normal(3.4, 0.5))
+        pyro.deterministic("twice", 2.0 * omega)
+        pyro.sample("y", dist.Normal(torch.sin(omega[..., None] * evidence.t), 0.1).to_event(1), obs=evidence.y)
+
+    check(named, WAVE)
+    with_name, without = (least_squares.run(model, WAVE, seed=0, num_draws=5) for model in (named, wave))
+    assert set(with_name.draws) == {"omega"}
+    np.testing.assert_array_equal(with_name.draws["omega"], without.draws["omega"])
+    assert with_name.log_evidence == without.log_evidence
 
 
 def test_same_seed_same_bits_and_other_seed_other_draws() -> None:

@@ -205,8 +205,8 @@ def simulate(model: Model, evidence: Any, *, num: int, seed: int) -> Latents:
 
 
 def observe(evidence: Any, draws: Latents) -> tuple[Any, Latents]:
-    """Move simulated observations into the evidence; the rest of the draws are latents."""
-    seen = {name: draws[name] for name in evidence._fields if name in draws}
+    """Move simulated observations into the evidence fields that are None; the rest of the draws are latents."""
+    seen = {name: draws[name] for name in evidence._fields if name in draws and getattr(evidence, name) is None}
     return evidence._replace(**seen), {n: v for n, v in draws.items() if n not in seen}
 
 

@@ -346,6 +346,14 @@ def test_observing_moves_draws_into_the_evidence() -> None:
     assert set(latents) == {"beta"}
 
 
+def test_observing_fills_only_what_is_missing() -> None:
+    """A latent may share the name of a field that is given, such as a covariate."""
+    times = torch.arange(3.0)
+    evidence, latents = observe(Readings(times, None), {"t": torch.zeros(3), "y": torch.ones(3)})
+    assert evidence.t is times
+    assert set(latents) == {"t"}
+
+
 def test_check_catches_a_missing_to_event() -> None:
     """Two readings: as many as the draws of the check, so that Pyro's own shapes agree by accident."""
 

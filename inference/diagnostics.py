@@ -22,6 +22,7 @@ from inference.posterior import Posterior
 Array = NDArray[np.float64]
 
 MODEL_INDEX = "model_index"
+MIN_DRAWS = 4  # of a chain; halves of fewer have no variance, and R-hat and ESS are NaN
 
 
 def scalars(posterior: Posterior) -> dict[str, Array]:
@@ -65,7 +66,9 @@ def summary(posterior: Posterior) -> dict[str, dict[str, float]]:
 def flags(posterior: Posterior, *, max_r_hat: float = 1.01, min_ess: float = 400.0) -> list[str]:
     """What speaks against the draws, in words: the engine's own flags first, then R-hat and ESS."""
     found = list(posterior.info.get("flags", []))
-    num_chains = posterior.shape[0]
+    num_chains, num_draws = posterior.shape[:2]
+    if num_draws < MIN_DRAWS:
+        return [*found, f"only {num_draws} draws a chain: convergence cannot be judged; keep at least {MIN_DRAWS}"]
     for label, row in summary(posterior).items():
         if row["sd"] == 0.0:
             continue  # a constant has neither R-hat nor ESS
@@ -74,7 +77,7 @@ def flags(posterior: Posterior, *, max_r_hat: float = 1.01, min_ess: float = 400
                 f"r_hat of '{label}' is {row['r_hat']:.3g} over {num_chains} chains (above {max_r_hat}): "
                 "the chains disagree; run longer, or start and anneal them better"
             )
-        if row["ess_bulk"] < min_ess:
+        if not row["ess_bulk"] >= min_ess:  # NaN too
             found.append(
                 f"'{label}' has {row['ess_bulk']:.0f} effective draws (below {min_ess:.0f}): "
                 f"its mean is known to {row['mcse']:.2g}; run longer if that is not enough"

@@ -56,6 +56,19 @@ def test_good_chains_and_constants_raise_no_flag() -> None:
     assert diagnostics.flags(good) == []
 
 
+@pytest.mark.parametrize(("num_chains", "num_draws"), [(1, 1), (4, 1), (4, 3)])
+def test_too_few_draws_to_judge_are_told(num_chains: int, num_draws: int) -> None:
+    found = diagnostics.flags(Posterior({"d0": chains(0.0, num_draws, num_chains=num_chains)}))
+    assert len(found) == 1
+    assert f"only {num_draws} draws a chain: convergence cannot be judged" in found[0]
+
+
+def test_draws_whose_effective_size_is_unknown_are_told() -> None:
+    broken = chains(0.0, 1000)
+    broken[2, 17] = np.nan
+    assert any("'d0' has nan effective draws" in flag for flag in diagnostics.flags(Posterior({"d0": broken})))
+
+
 def test_flags_of_the_engine_come_first() -> None:
     posterior = Posterior({"d0": chains(0.9, 600)}, info={"flags": ["not converged: why"]})
     assert diagnostics.flags(posterior)[0] == "not converged: why"

@@ -17,12 +17,6 @@ def normalise(log_weights: Array) -> Array:
     return weights / weights.sum()
 
 
-def log_mean_exp(log_weights: Array) -> float:
-    """log of the mean weight; the evidence estimate of an importance sampler."""
-    top = float(np.max(log_weights))
-    return top + float(np.log(np.mean(np.exp(log_weights - top))))
-
-
 def effective_size(log_weights: Array) -> float:
     """Kish's effective sample size, (sum w)^2 / sum w^2."""
     weights = normalise(log_weights)

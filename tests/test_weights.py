@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -21,11 +19,6 @@ def test_normalised_weights_sum_to_one_whatever_their_scale() -> None:
 def test_weights_without_a_finite_maximum_are_refused(bad: list[float]) -> None:
     with pytest.raises(FloatingPointError, match="no finite maximum"):
         weights.normalise(np.array(bad))
-
-
-def test_log_mean_exp_is_the_log_of_the_mean_weight() -> None:
-    log_weights = np.log([1.0, 2.0, 6.0])
-    assert weights.log_mean_exp(log_weights + 900.0) == pytest.approx(math.log(3.0) + 900.0)
 
 
 def test_effective_size_counts_equal_weights_and_ignores_zeros() -> None:

@@ -119,7 +119,7 @@ def _sample_sites(model: Model, evidence: Any) -> dict[str, Site]:
     return {n: site for n, site in nodes.items() if site["type"] == "sample" and not _is_bookkeeping(site)}
 
 
-def _is_bookkeeping(site: Site) -> bool:
+def _is_bookkeeping(site: Any) -> bool:
     """Of a plate, or a name for a computed value (pyro.deterministic): no random variable."""
     return bool(site_is_subsample(site) or site["infer"].get("_deterministic", False))
 

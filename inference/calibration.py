@@ -133,7 +133,7 @@ def z_score(gaps: NDArray[np.float64]) -> float:
 
 def predict(model: Model, latents: Latents, blank: Any, *, seed: int) -> Any:
     """Evidence with fresh observations given latents {site: (B, *event)}; randomness is local."""
-    with torch.random.fork_rng(devices=[]), quiet_doubles():
+    with quiet_doubles(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         trace = poutine.trace(poutine.condition(model, data=latents)).get_trace(blank)
     sites = ((n, s) for n, s in trace.nodes.items() if s["type"] == "sample" and not s["is_observed"])

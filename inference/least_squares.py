@@ -243,7 +243,9 @@ def _by_site(bound: Bound, x: Tensor) -> list[tuple[str, Tensor]]:
 def _blame_value(bound: Bound, x: Tensor) -> str:
     latents = bound.latents(x)
     split = terms(bound.model, latents, bound.evidence)  # names a site that is NaN itself
-    sites = [name for name, height in split.likelihood.items() if not bool(torch.isfinite(height).all())]
+    fixed = {name: height for name, height in split.prior.items() if name not in bound.shapes}
+    heights = split.likelihood | fixed
+    sites = [name for name, height in heights.items() if not bool(torch.isfinite(height).all())]
     values = {name: value.tolist() for name, value in latents.items()}
     return f"the residuals of {sites} are not finite at {values}"
 

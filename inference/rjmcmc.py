@@ -192,7 +192,7 @@ def run(
     init         {site: value} first state of all chains; without it `start`: draws from the prior, or
                  the model's data-driven start
     thin         keep every thin-th state after the warm-up; warmup = num_steps keeps the last state
-    resample     resample chains between themselves while they anneal
+    resample     resample chains between themselves while they anneal, every BLOCK steps
     polish       climb greedily from the best state of every chain over edits of the structure; the draws stay
     num_workers  threads of the compiled path; the draws do not depend on it
 
@@ -213,11 +213,8 @@ def run(
         )
     if thin < 1 or thin > max(num_steps - warmup, 1):
         raise InputError(f"thin must be 1 to the {num_steps - warmup} steps after the warm-up, but is {thin}")
-    if resample and (warmup <= BLOCK or start_temperature == 1):
-        raise InputError(
-            f"resample=true acts every {BLOCK} steps while chains anneal; it needs a warmup longer than that and "
-            f"start_temperature > 1, but they are {warmup} and {start_temperature}"
-        )
+    if resample and start_temperature == 1:
+        raise InputError("resample=true acts while chains anneal: it needs start_temperature above 1")
     if polish and (path == "batched" or not hasattr(model, "kernel")):
         raise InputError(f"polish=true needs the compiled path, which {type(model).__name__} does not run on here")
     if init is not None:

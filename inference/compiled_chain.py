@@ -59,7 +59,8 @@ def _chain(  # type: ignore[no-untyped-def]
 
 @lru_cache(maxsize=1)
 def compiled_chain() -> Any:
-    """The chain for any kernel."""
+    """The chain for any kernel, called without looking at the types of its arguments: that takes longer than
+    thirty steps."""
     types = kernel_types()
     vector, index, function = types["vector"], types["index"], types["function"]
     rows = nb.float64[:, ::1]
@@ -67,7 +68,8 @@ def compiled_chain() -> Any:
         *(function(types[name]) for name in ("propose", "evaluate", "commit")),
         *(vector, vector, vector, rows, vector, vector, vector, index, vector, rows, rows),
     )
-    return nb.njit(signature, cache=True, nogil=True)(_chain)
+    only: Any = next(iter(nb.njit(signature, cache=True, nogil=True)(_chain).overloads.values()))
+    return only.entry_point
 
 
 class CompiledChains:
@@ -133,10 +135,14 @@ class CompiledChains:
         """Replace chain c by chain index[c]."""
         self.z[:], self.log_terms[:] = self.z[index], self.log_terms[index]
 
-    def best(self) -> tuple[dict[str, Array], float]:
-        """The best state of all chains so far and its log joint."""
+    def best(self) -> tuple[Array, float]:
+        """The best state of all chains so far, packed, and its log joint."""
         row = self.tops[self.tops[:, -1].argmax()]
-        return self.kernel.unpack(row[:-1]), float(row[-1])
+        return row[:-1].copy(), float(row[-1])
+
+    def unpack(self, states: list[Array]) -> dict[str, Array]:
+        """{site: (S, *event)} of states from `best`."""
+        return self.kernel.unpack(np.stack(states))
 
     def polish(self) -> None:
         """Climb from the best state of every chain; the kernel must have edits and a refit."""

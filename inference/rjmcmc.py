@@ -89,7 +89,8 @@ class Chains(Protocol):
     def counts(self) -> Array: ...
     def advance(self, first: int, temperatures: Array) -> list[dict[str, Array]]: ...
     def choose(self, index: Array) -> None: ...
-    def best(self) -> tuple[dict[str, Array], float]: ...
+    def best(self) -> tuple[Any, float]: ...
+    def unpack(self, states: list[Any]) -> dict[str, Array]: ...
 
 
 class BatchedChains:
@@ -150,6 +151,10 @@ class BatchedChains:
     def best(self) -> tuple[dict[str, Array], float]:
         """The best state of all chains so far and its log joint."""
         return self.top
+
+    def unpack(self, states: list[dict[str, Array]]) -> dict[str, Array]:
+        """{site: (S, *event)} of states from `best`."""
+        return {n: np.stack([state[n] for state in states]) for n in states[0]}
 
 
 def temperatures_of(num_steps: int, warmup: int, start_temperature: float) -> Array:
@@ -276,7 +281,7 @@ def _check_start(chains: Chains) -> None:
         )
 
 
-def _snapshot(chains: Chains, step: int, began: float) -> tuple[int, float, float, dict[str, Array]]:
+def _snapshot(chains: Chains, step: int, began: float) -> tuple[int, float, float, Any]:
     state, joint = chains.best()
     return step, time.perf_counter() - began, joint, state
 
@@ -288,13 +293,13 @@ def _posterior(model: Any, chains: Chains, draws: list[Any], shots: list[Any], s
     acceptance = {
         name: float(c[ACCEPTED] / max(c[TRIED], 1)) for name, c, u in zip(chains.names, counts, used, strict=True) if u
     }
-    states = {n: np.stack([shot[3][n] for shot in shots]) for n in shots[0][3]}
+    states = chains.unpack([shot[3] for shot in shots])
     steps, times, joints = (np.array([shot[k] for shot in shots]) for k in range(3))
     dimension = getattr(model, "dimension", None)
     return Posterior(
         draws=joined,
         model_index=joined[dimension] if dimension else None,
-        estimate=chains.best()[0],
+        estimate={n: values[-1] for n, values in states.items()},
         info={
             "engine": "rjmcmc",
             "seconds": seconds,

@@ -171,54 +171,76 @@ def update_arms(z, coef, stray, cell, entries, which, keys, turns, scatter, rows
         which[1, a], which[3, a] = row, turn
 
 
-def evaluate(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
-    """out = (log prior, log likelihood) of a packed state."""
+@nb.njit(cache=True)
+def exact_data(floats, halves):  # type: ignore[no-untyped-def]
+    """Coefficients (18, H) and costs of stray halves (H,) in the data of the exact likelihood."""
+    end = FLOATS + NUM_COEFFICIENTS * halves
+    return floats[FLOATS:end].reshape((NUM_COEFFICIENTS, halves)), floats[end : end + halves]
+
+
+def evaluate_exact(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
+    """out = (log prior, log likelihood) of a packed state, lane labels summed out."""
     out[0], out[1] = log_prior(z, floats), -math.inf
     if out[0] == -math.inf:
         return
     z, floats, cache = borrow(z), borrow(floats), borrow(cache)  # type: ignore[call-arg]
-    kind, halves, entries, num = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
-    which, keys, turns, scatter, rows, counts, room = memory(cache, halves)
-    if kind == POINT:
-        out[1] = point_score(z, floats, ints, counts)
-        return
-    cell, stray = 0, floats[:0]
-    if kind == HALF:
-        cell = cell_of(z[1], z[2])
-        coef = coefficients_at(cell, floats, ints, room)
-    else:
-        coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
-        stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
-    update_arms(z, coef, stray, cell + 1.0, entries, which, keys, turns, scatter, rows)
+    halves, entries, num = ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
+    which, keys, turns, scatter, rows, _, room = memory(cache, halves)
+    coef, stray = exact_data(floats, halves)
+    update_arms(z, coef, stray, 1.0, entries, which, keys, turns, scatter, rows)
     pick, low, second = which[1], room[:halves], room[halves : 2 * halves]
-    if kind == EXACT:
-        density.two_lowest(rows, pick, num, low, second)
+    density.two_lowest(rows, pick, num, low, second)
+    share = (floats[LOG_CLUTTER], floats[LOG_KEPT])
     out[1] = floats[CONSTANT]
     for side in range(2):
         first, last = side_range(side, entries, halves)
         lanes = lanes_of(z, ENTRIES + side)
-        if kind == EXACT:
-            share = (floats[LOG_CLUTTER], floats[LOG_KEPT])
-            out[1] += density.sum_arms(rows, pick, num, first, last, lanes, low, second, stray, *share)
-        else:
-            out[1] += density.closest_arms(coef[W_ACROSS], rows, pick, num, first, last, lanes, counts)
+        out[1] += density.sum_arms(rows, pick, num, first, last, lanes, low, second, stray, *share)
 
 
-def refit(z, floats, ints, cache):  # type: ignore[no-untyped-def]
-    """One Gauss-Newton step of the continuous numbers, in place; the cache holds z evaluated last."""
-    kind, halves, entries = ints[LIKELIHOOD], ints[NUM_HALVES], ints[NUM_ENTRIES]
-    which, _, _, _, rows, _, room = memory(cache, halves)
-    if kind == HALF:
-        coef = coefficients_at(cell_of(z[1], z[2]), floats, ints, room)
-        stray = np.full(halves, density.NO_LANE)
-    else:
-        coef = floats[FLOATS : FLOATS + NUM_COEFFICIENTS * halves].reshape((NUM_COEFFICIENTS, halves))
-        stray = floats[FLOATS + NUM_COEFFICIENTS * halves : FLOATS + (NUM_COEFFICIENTS + 1) * halves]
+def evaluate_closest(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
+    """out = (log prior, score) of a packed state, [M20]'s closest lanes for half tracks or points."""
+    out[0], out[1] = log_prior(z, floats), -math.inf
+    if out[0] == -math.inf:
+        return
+    z, floats, cache = borrow(z), borrow(floats), borrow(cache)  # type: ignore[call-arg]
+    halves, entries, num = ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
+    which, keys, turns, scatter, rows, counts, room = memory(cache, halves)
+    if ints[LIKELIHOOD] == POINT:
+        out[1] = point_score(z, floats, ints, counts)
+        return
+    cell = cell_of(z[1], z[2])
+    coef = coefficients_at(cell, floats, ints, room)
+    update_arms(z, coef, floats[:0], cell + 1.0, entries, which, keys, turns, scatter, rows)
+    out[1] = floats[CONSTANT]
+    for side in range(2):
+        first, last = side_range(side, entries, halves)
+        lanes = lanes_of(z, ENTRIES + side)
+        out[1] += density.closest_arms(coef[W_ACROSS], rows, which[1], num, first, last, lanes, counts)
+
+
+@nb.njit(cache=True)
+def newton(z, coef, stray, entries, rows, pick, floats):  # type: ignore[no-untyped-def]
+    """One Gauss-Newton step of the continuous numbers, in place."""
     size = 2 + FREE * int(z[0])
     hessian, gradient = np.empty((size, size)), np.empty(size)
-    quadratic_model(z, coef, entries, stray, rows, which[1], floats, hessian, gradient)
+    quadratic_model(z, coef, entries, stray, rows, pick, floats, hessian, gradient)
     if solve_spd(hessian, gradient, size):
         take_step(z, gradient, floats[GAP_MAX])
+
+
+def refit_exact(z, floats, ints, cache):  # type: ignore[no-untyped-def]
+    """A Gauss-Newton step; the cache holds z evaluated last."""
+    which, _, _, _, rows, _, _ = memory(cache, ints[NUM_HALVES])
+    coef, stray = exact_data(floats, ints[NUM_HALVES])
+    newton(z, coef, stray, ints[NUM_ENTRIES], rows, which[1], floats)
+
+
+def refit_half(z, floats, ints, cache):  # type: ignore[no-untyped-def]
+    """A Gauss-Newton step with [M20]'s halves; the cache holds z evaluated last."""
+    which, _, _, _, rows, _, room = memory(cache, ints[NUM_HALVES])
+    coef = coefficients_at(cell_of(z[1], z[2]), floats, ints, room)
+    newton(z, coef, np.full(ints[NUM_HALVES], density.NO_LANE), ints[NUM_ENTRIES], rows, which[1], floats)
 
 
 def commit(cache):  # type: ignore[no-untyped-def]
@@ -228,12 +250,21 @@ def commit(cache):  # type: ignore[no-untyped-def]
         cache[a], cache[2 * n + a] = cache[n + a], cache[3 * n + a]
 
 
-@lru_cache(maxsize=1)
-def compiled() -> dict[str, Any]:
-    """The kernel's functions with explicit signatures, from the disk cache where possible."""
-    types = kernel_types()
-    functions = {"propose": moves.propose, "evaluate": evaluate, "commit": commit, "edit": edit, "refit": refit}
-    return {n: nb.njit(types[n], cache=True, error_model="numpy")(f) for n, f in functions.items()}
+@lru_cache
+def compiled(function: Any, kind: str) -> Any:
+    """A function of a kernel with its explicit signature, from the disk cache where possible."""
+    return nb.njit(kernel_types()[kind], cache=True, error_model="numpy")(function)
+
+
+def compiled_evaluate(model: Junction) -> Any:
+    """The density of a model: each likelihood is compiled when it is first used."""
+    return compiled(evaluate_exact if model.likelihood == "exact" else evaluate_closest, "evaluate")
+
+
+def compiled_refit(model: Junction) -> Any:
+    """The refit of a model; None where every point has a lane of its own."""
+    functions = {"exact": refit_exact, "half": refit_half}
+    return compiled(functions[model.likelihood], "refit") if model.likelihood in functions else None
 
 
 def settings(model: Junction) -> Array:
@@ -276,13 +307,13 @@ def junction_kernel(model: Junction, evidence: JunctionEvidence) -> Kernel:
         floats=floats,
         ints=ints,
         cache_size=int(memory_size(ints)),
-        propose=compiled()["propose"],
-        evaluate=compiled()["evaluate"],
-        commit=compiled()["commit"],
+        propose=compiled(moves.propose, "propose"),
+        evaluate=compiled_evaluate(model),
+        commit=compiled(commit, "commit"),
         pack=lambda latents: pack(latents, constants, evidence.origin),
         unpack=lambda z: unpack(z, constants, evidence.origin),
-        edit=compiled()["edit"],
-        refit=compiled()["refit"] if model.likelihood != "point" else None,
+        edit=compiled(edit, "edit"),
+        refit=compiled_refit(model),
         num_edits=MAX_ARMS * EDITS_PER_ARM,
     )
 
@@ -301,7 +332,7 @@ def batched_moves(model: Junction) -> tuple[Move, ...]:
         z = pack(latents, constants, origin)
         z_new, u_new, log_q = np.empty_like(z), np.empty(u.shape), np.empty((len(z), 3))
         valid = np.empty(len(z), dtype=np.bool_)
-        propose, numbers_in = compiled()["propose"], np.ascontiguousarray(u.numpy())
+        propose, numbers_in = compiled(moves.propose, "propose"), np.ascontiguousarray(u.numpy())
         for b in range(len(z)):
             valid[b] = propose(kind, z[b], numbers_in[b], numbers, none, z_new[b], u_new[b], log_q[b])
         new = {name: torch.from_numpy(np.array(value)) for name, value in unpack(z_new, constants, origin).items()}

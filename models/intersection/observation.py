@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from models.intersection.evidence import JunctionEvidence
-from models.intersection.kernel import bound_data, compiled, memory_size
+from models.intersection.kernel import bound_data, compiled_evaluate, memory_size
 from models.intersection.moments import CHORD
 from models.intersection.packing import MAX_ARMS, pack
 from models.program import InputError
@@ -61,7 +61,7 @@ class TracksOnLanes(TorchDistribution):
                 f"likelihood '{self.model.likelihood}' scores the tracks that its evidence was prepared from; "
                 "prepare() other tracks, or use likelihood=exact"
             )
-        z, evaluate = self._packed(), compiled()["evaluate"]
+        z, evaluate = self._packed(), compiled_evaluate(self.model)
         out, points = np.empty((len(z), 2)), value.reshape(value.shape[:-2].numel(), 3, value.shape[-1])
         for b, observed in enumerate(points):
             floats, ints = bound_data(self.model, self.evidence, self.evidence._replace(points=observed).moments)

@@ -59,8 +59,7 @@ def _chain(  # type: ignore[no-untyped-def]
 
 @lru_cache(maxsize=1)
 def compiled_chain() -> Any:
-    """The chain for any kernel, called without looking at the types of its arguments: that takes longer than
-    thirty steps."""
+    """The chain for any kernel, called without looking at the types of its arguments at every block."""
     types = kernel_types()
     vector, index, function = types["vector"], types["index"], types["function"]
     rows = nb.float64[:, ::1]

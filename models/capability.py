@@ -120,8 +120,8 @@ def kernel_types() -> dict[str, Any]:
 def pointer(function: Any) -> Any:
     """A compiled numba function of one explicit signature as a plain function pointer.
 
-    Passing the function itself to machine code looks its address up at every call, which takes longer than
-    fifty steps of a chain; a pointer is found once."""
+    Passing the function itself to machine code looks its address up at every call, which is slow;
+    a pointer is found once."""
     from numba.core.types import WrapperAddressProtocol
 
     (signature,) = function.nopython_signatures

@@ -10,7 +10,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def borrow(context: Any, array: Any) -> Any:  # type: ignore[no-untyped-def]
-    """The same array with no owner: its views cost no atomic counting (a third of a 2 us density).
+    """The same array with no owner: its views cost no atomic counting.
 
     Valid only while the owner lives, that is, inside the call that was handed the array."""
 

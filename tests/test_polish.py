@@ -103,13 +103,13 @@ def test_gradient_of_the_refit_is_that_of_the_density(name: str) -> None:
         z[place] += rng.normal() * (0.1 if place < HEAD else scale[field_of(place)])
     cache = np.zeros(kernel.cache_size)
     assert math.isfinite(evaluate(kernel, z, cache))
-    halves, entries = int(kernel.ints[jk.NUM_HALVES]), int(kernel.ints[jk.NUM_ENTRIES])
+    halves = int(kernel.ints[jk.NUM_HALVES])
     which, _, _, _, rows, _, _ = jk.memory(cache, halves)
     coef = kernel.floats[jk.FLOATS : jk.FLOATS + NUM_COEFFICIENTS * halves].reshape(NUM_COEFFICIENTS, halves)
     stray = kernel.floats[jk.FLOATS + NUM_COEFFICIENTS * halves :][:halves]
     size = 2 + FREE * num
     hessian, gradient = np.empty((size, size)), np.empty(size)
-    quadratic_model(z, coef, entries, stray, rows, which[1], kernel.floats, hessian, gradient)
+    quadratic_model(z, coef, stray, rows, which[1], kernel.floats, hessian, gradient)
     for place in free:
         step = 1e-4 * (0.1 if place < HEAD else scale[field_of(place)])
         plus, minus = z.copy(), z.copy()

@@ -29,7 +29,8 @@ from models.intersection.moments import (
     A_Y,
     A_YY,
     CHORD,
-    PHI,
+    OUTGOING,
+    SIDE,
     W_ACROSS,
     W_ALONG,
     W_HEADING,
@@ -50,9 +51,8 @@ FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def scatter_row(coef, angle, bend, out):  # type: ignore[no-untyped-def]
-    """Cost of the scatter of every half track around lanes of this direction and bend, (H,)."""
-    dx, dy = math.cos(angle), math.sin(angle)
+def scatter_row(coef, dx, dy, bend, out):  # type: ignore[no-untyped-def]
+    """Cost of the scatter of every half track around lanes of direction (dx, dy) and this bend, (H,)."""
     xx, yy, xy = dx * dx, dy * dy, dx * dy
     kx, ky, kk = bend * dx, bend * dy, bend * bend
     for h in range(coef.shape[1]):
@@ -62,42 +62,69 @@ def scatter_row(coef, angle, bend, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def mean_row(coef, first, last, side, cx, cy, arm, scatter, row):  # type: ignore[no-untyped-def]
-    """Add the cost of the mean residuals to the closest lane, halves first:last of one side.
+def closest_lane(beyond, width, top):  # type: ignore[no-untyped-def]
+    """Number of the lane, 0 the innermost and `top` the outermost, whose middle is closest."""
+    k = np.floor(beyond / width + 0.5)  # math.floor would make a whole number of it and back
+    k = k if k > 0.0 else 0.0
+    return k if k < top else top
 
-    arm = (angle, gap, entries, exits, width, bend, shift); side +1 entries, -1 exits.
-    row  (3, H) cost, lane and residual from the middle of the lane [m], filled between first and last"""
-    angle, gap, width, bend, shift = arm[0], arm[1], arm[4], arm[5], arm[6]
-    num = arm[2] if side > 0 else arm[3]
-    dx, dy = math.cos(angle), math.sin(angle)
-    axis = -dy * cx + dx * cy + shift
-    along = dx * cx + dy * cy
-    inner = 0.5 * gap + 0.5 * width
-    heading = angle + (math.pi if side > 0 else 0.0) - 0.5 * CHORD * bend
-    top, per_width = num - 1.0, 1.0 / width
-    for h in range(first, last):
-        across = -dy * coef[X, h] + dx * coef[Y, h] - axis - bend * coef[T, h]
-        e = side * across - inner
-        k = min(max(math.floor(e * per_width + 0.5), 0.0), top)
-        r = e - k * width
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def beyond_innermost(coef, h, dx, dy, axis, arm):  # type: ignore[no-untyped-def]
+    """Distance of a half from the middle of the innermost lane of an arm of direction (dx, dy), outwards [m]."""
+    across = -dy * coef[X, h] + dx * coef[Y, h] - axis - arm[5] * coef[T, h]
+    return coef[SIDE, h] * across - 0.5 * arm[1] - 0.5 * arm[4]
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def axis_of(dx, dy, cx, cy, arm):  # type: ignore[no-untyped-def]
+    """Distance of the axis of an arm of direction (dx, dy) from the origin, to the left [m]."""
+    return -dy * cx + dx * cy + arm[6]
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def lane_number(coef, h, cx, cy, arm):  # type: ignore[no-untyped-def]
+    """Number of the lane of an arm that is closest to a half, 0 the innermost."""
+    dx, dy = math.cos(arm[0]), math.sin(arm[0])
+    top = arm[2] - 1.0 if coef[SIDE, h] > 0.0 else arm[3] - 1.0
+    return closest_lane(beyond_innermost(coef, h, dx, dy, axis_of(dx, dy, cx, cy, arm), arm), arm[4], top)
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def mean_row(coef, cx, cy, dx, dy, arm, scatter, cost):  # type: ignore[no-untyped-def]
+    """Cost of every half track with its closest lane of an arm, (H,); NO_LANE where it has none of the side.
+
+    arm = (angle, gap, entries, exits, width, bend, shift), (dx, dy) its direction; scatter (H,) from `scatter_row`.
+    One loop from 0 over whole rows with one store: this is what compilers turn into vector code."""
+    width, bend = arm[4], arm[5]
+    axis, along = axis_of(dx, dy, cx, cy, arm), dx * cx + dy * cy
+    in_top, out_top = arm[2] - 1.0, arm[3] - 1.0
+    outgoing = arm[0] - 0.5 * CHORD * bend
+    for h in range(coef.shape[1]):
+        top = in_top if coef[SIDE, h] > 0.0 else out_top
+        beyond = beyond_innermost(coef, h, dx, dy, axis, arm)
+        r = beyond - width * closest_lane(beyond, width, top)
         v = dx * coef[X, h] + dy * coef[Y, h] - along - coef[S, h]
-        p = coef[PHI, h] - heading - bend * coef[S, h]
-        p = wrap(p)
+        p = wrap(coef[OUTGOING, h] - outgoing - bend * coef[S, h])
         mean = coef[W_ACROSS, h] * r * r + coef[W_ALONG, h] * v * v + coef[W_HEADING, h] * p * p
-        row[0, h] = scatter[h] + 0.5 * mean
-        row[1, h], row[2, h] = k, r
+        value = scatter[h] + 0.5 * mean
+        cost[h] = value if top >= 0.0 else NO_LANE
 
 
 @nb.njit(cache=True, error_model="numpy")
-def sum_lanes_row(coef, first, last, width, num, stray, row):  # type: ignore[no-untyped-def]
-    """Turn the cost of the closest of `num` lanes into -log sum over the lanes of exp(-cost).
+def sum_lanes_row(coef, cx, cy, dx, dy, arm, stray, cost):  # type: ignore[no-untyped-def]
+    """Turn the cost of the closest lane of an arm into -log sum over its lanes of exp(-cost), (H,).
 
     Halves that are far better off as stray ones are left alone: they add nothing that counts."""
-    top = num - 1.0
-    for h in range(first, last):
-        if row[0, h] > stray[h] + 3.0 * NEGLIGIBLE:
+    width = arm[4]
+    axis = axis_of(dx, dy, cx, cy, arm)
+    for h in range(coef.shape[1]):
+        if cost[h] > stray[h] + 3.0 * NEGLIGIBLE:
             continue
-        unit, k, r = 0.5 * coef[W_ACROSS, h] * width, row[1, h], row[2, h]
+        top = arm[2] - 1.0 if coef[SIDE, h] > 0.0 else arm[3] - 1.0
+        beyond = beyond_innermost(coef, h, dx, dy, axis, arm)
+        k = closest_lane(beyond, width, top)
+        unit, r = 0.5 * coef[W_ACROSS, h] * width, beyond - k * width
         up = unit * (width - 2.0 * r) if k < top else FAR_LANE
         down = unit * (width + 2.0 * r) if k > 0.0 else FAR_LANE
         if up >= FAR_LANE and down >= FAR_LANE:
@@ -111,9 +138,9 @@ def sum_lanes_row(coef, first, last, width, num, stray, row):  # type: ignore[no
                     break
                 extra += math.exp(-more)
         if extra < 1e-3:  # log(1 + extra), to 1e-13
-            row[0, h] -= extra * (1.0 - extra * (0.5 - extra / 3.0))
+            cost[h] -= extra * (1.0 - extra * (0.5 - extra / 3.0))
         else:
-            row[0, h] -= math.log1p(extra)
+            cost[h] -= math.log1p(extra)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -122,7 +149,7 @@ def two_lowest(rows, pick, num_arms, low, second):  # type: ignore[no-untyped-de
     low[:] = NO_LANE
     second[:] = NO_LANE
     for a in range(num_arms):
-        row = rows[int(pick[a]), a, 0]
+        row = rows[int(pick[a]), a]
         for h in range(len(low)):
             value, least = row[h], low[h]
             above = value if value > least else least
@@ -130,36 +157,56 @@ def two_lowest(rows, pick, num_arms, low, second):  # type: ignore[no-untyped-de
             second[h] = above if above < second[h] else second[h]
 
 
-@nb.njit(cache=True, error_model="numpy")
-def sum_arms(rows, pick, num_arms, first, last, num_lanes, low, second, clutter, log_clutter, log_kept):  # type: ignore[no-untyped-def]
-    """Log likelihood of halves first:last of one side, labels summed out.
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def best_alone(side, labels, shares, stray, low, second):  # type: ignore[no-untyped-def]
+    """Log likelihood as if every half were where it is best; `second` becomes what its next best place costs more.
 
-    rows         (2, A, 3, H) cost, lane, residual per arm; rows[pick[a], a] is the one that counts
-    num_lanes    lanes of this side on all arms
-    low, second  (H,) from `two_lowest`
-    clutter      (H,) -log p_0 minus the Gaussian normaliser of the half
-    log_clutter  log of the share of clutter, log_kept of the rest"""
-    if num_lanes < 0.5:  # nowhere to be: every half is stray
-        return -clutter[first:last].sum()
-    label = log_kept - math.log(num_lanes)
+    labels  log probability of a lane (exits, entries), shares log probability of a stray half"""
     total = 0.0
-    for h in range(first, last):
-        lane, stray = low[h] - label, clutter[h] - log_clutter
-        best = min(lane, stray)
+    for h in range(len(low)):
+        label, share = (labels[1], shares[1]) if side[h] > 0.0 else (labels[0], shares[0])
+        lane, alone = low[h] - label, stray[h] - share
+        best = lane if lane < alone else alone
         total -= best
-        if max(lane, stray) - best < NEGLIGIBLE or second[h] - label - best < NEGLIGIBLE:
-            share = math.exp(best - stray)
-            for a in range(num_arms):
-                share += math.exp(best - (rows[int(pick[a]), a, 0, h] - label))
-            total += math.log(share)
+        other, more = second[h] - label - best, (lane if lane > alone else alone) - best
+        second[h] = more if more < other else other
     return total
 
 
 @nb.njit(cache=True, error_model="numpy")
-def closest_arms(weights, rows, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
+def sum_arms(rows, pick, num_arms, side, lanes, stray, log_clutter, log_kept, low, second):  # type: ignore[no-untyped-def]
+    """Log likelihood of all halves, labels summed out.
+
+    rows         (2, A, H) costs; rows[pick[a], a] is the one that counts
+    side         (H,) +1 entries, -1 exits
+    lanes        lanes of all arms (exits, entries); where there is none every half is stray
+    stray        (H,) -log p_0 minus the Gaussian normaliser of the half
+    log_clutter  log of the share of clutter, log_kept of the rest
+    low, second  (H,) from `two_lowest`; second is used up"""
+    some = (lanes[0] > 0.5, lanes[1] > 0.5)
+    labels = (
+        log_kept - math.log(lanes[0]) if some[0] else -NO_LANE,
+        log_kept - math.log(lanes[1]) if some[1] else -NO_LANE,
+    )
+    shares = (log_clutter if some[0] else 0.0, log_clutter if some[1] else 0.0)
+    total = best_alone(side, labels, shares, stray, low, second)
+    for h in range(len(low)):
+        if second[h] < NEGLIGIBLE:
+            label, share = (labels[1], shares[1]) if side[h] > 0.0 else (labels[0], shares[0])
+            alone = stray[h] - share
+            best = min(low[h] - label, alone)
+            weight = math.exp(best - alone)
+            for a in range(num_arms):
+                weight += math.exp(best - (rows[int(pick[a]), a, h] - label))
+            total += math.log(weight)
+    return total
+
+
+@nb.njit(cache=True, error_model="numpy")
+def closest_arms(coef, cx, cy, arms, rows, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
     """Score of halves first:last of one side with the closest lane each and multinomial counts.
 
-    weights  (H,) of the mean residuals; 0 where a half has no points: it is on no lane"""
+    arms  (A, 7) of the state; a half without points, of weight 0, is on no lane"""
     if last == first:
         return 0.0
     if num_lanes < 0.5:
@@ -167,15 +214,15 @@ def closest_arms(weights, rows, pick, num_arms, first, last, num_lanes, counts):
     counts[:] = 0.0
     total = 0.0
     for h in range(first, last):
-        if weights[h] == 0.0:
+        if coef[W_ACROSS, h] == 0.0:
             continue
         low, arm = math.inf, 0
         for a in range(num_arms):
-            value = rows[int(pick[a]), a, 0, h]
+            value = rows[int(pick[a]), a, h]
             if value < low:
                 low, arm = value, a
         total -= low
-        counts[arm, int(rows[int(pick[arm]), arm, 1, h])] += 1.0
+        counts[arm, int(lane_number(coef, h, cx, cy, arms[arm]))] += 1.0
     return total + multinomial(counts, num_lanes)
 
 

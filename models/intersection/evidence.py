@@ -131,12 +131,12 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
 
 
 def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Array:
-    """Coefficients of the density, (18, H), from moments (12, H)."""
+    """Coefficients of the density, (19, H), from moments (12, H)."""
     noise = model.noise
     out = np.empty((NUM_COEFFICIENTS, observed.shape[1]))
     heading = noise.heading if evidence.heading else math.inf
     along = along_moments(evidence.s, evidence.starts)
-    coefficients(observed, along, noise.position, noise.along, noise.offset, noise.phase, heading, out)
+    coefficients(observed, along, evidence.num_entries, noise.position, noise.along, noise.offset, noise.phase, heading, out)
     return out
 
 

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from models.capability import Kernel, Move, Proposal, kernel_types
 from models.intersection import density, moves
-from models.intersection.borrow import borrow
 from models.intersection.density import EXACT, HALF, LIKELIHOODS, POINT
 from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
-from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS, W_ACROSS
-from models.intersection.packing import ARM, ENTRIES, HEAD, MAX_ARMS, SIZE, pack, unpack
-from models.intersection.prior import GAP_MAX, log_prior, prior_numbers
+from models.intersection.moments import NUM_COEFFICIENTS, NUM_MOMENTS, SIDE
+from models.intersection.packing import ARM, ENTRIES, EXITS, HEAD, MAX_ARMS, SIZE, pack, unpack
+from models.intersection.prior import GAP_MAX, log_head, log_slot, prior_numbers
 from models.intersection.refit import EDITS_PER_ARM, FREE, edit, quadratic_model, solve_spd, take_step
 from models.intersection.split import (
     NUM_CELLS,
@@ -31,6 +30,7 @@ from models.intersection.split import (
     cell_of,
     half_ranges,
 )
+from models.intersection.window import window
 
 if TYPE_CHECKING:
     from models.intersection.state import Junction
@@ -44,7 +44,7 @@ FLOATS = moves.NUM_SETTINGS + 5
 LIKELIHOOD, NUM_HALVES, NUM_ENTRIES, NUM_TRACKS, MARGIN = range(5)
 INTS = 5
 KEY = 2 + ARM  # a row depends on the centre and on its arm
-TURN = 3  # its scatter on direction, bend and the split
+TURN = 3  # its scatter on angle, bend and the split; the direction is kept beside them
 MAX_COUNTS = 10  # lanes of a side, at most
 
 
@@ -52,7 +52,7 @@ MAX_COUNTS = 10  # lanes of a side, at most
 def memory_size(ints):  # type: ignore[no-untyped-def]
     """Length of the cache for this evidence."""
     halves = ints[NUM_HALVES]
-    size = MAX_ARMS * (4 + 2 * KEY + 2 * TURN + 8 * halves + MAX_COUNTS) + 2 * halves
+    size = MAX_ARMS * (4 + ARM + 2 * KEY + 2 * (TURN + 2) + 4 * halves + MAX_COUNTS) + 2 * halves
     if ints[LIKELIHOOD] == HALF:
         size += NUM_CELLS + (NUM_MOMENTS + 5) * halves + NUM_CELLS * NUM_COEFFICIENTS * halves
     return size
@@ -61,20 +61,38 @@ def memory_size(ints):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True)
 def memory(cache, halves):  # type: ignore[no-untyped-def]
     """Named views of the cache: which row of each slot is current and which is evaluated, for rows and for their
-    scatter; the numbers each was computed from; scatter (2, A, H); cost, lane, residual (2, A, 3, H); counts; room."""
+    scatter; the numbers each was computed from; scatter (2, A, H); costs (2, A, H); counts; room."""
     n = MAX_ARMS
-    which = cache[: 4 * n].reshape((4, n))
-    o = 4 * n
-    keys = cache[o : o + 2 * n * KEY].reshape((2, n, KEY))
+    which, o = window(cache, 0, (4, n)), (4 + ARM) * n
+    keys = window(cache, o, (2, n, KEY))
     o += 2 * n * KEY
-    turns = cache[o : o + 2 * n * TURN].reshape((2, n, TURN))
-    o += 2 * n * TURN
-    scatter = cache[o : o + 2 * n * halves].reshape((2, n, halves))
+    turns = window(cache, o, (2, n, TURN + 2))
+    o += 2 * n * (TURN + 2)
+    scatter = window(cache, o, (2, n, halves))
     o += 2 * n * halves
-    rows = cache[o : o + 6 * n * halves].reshape((2, n, 3, halves))
-    o += 6 * n * halves
-    counts = cache[o : o + n * MAX_COUNTS].reshape((n, MAX_COUNTS))
-    return which, keys, turns, scatter, rows, counts, cache[o + n * MAX_COUNTS :]
+    rows = window(cache, o, (2, n, halves))
+    o += 2 * n * halves
+    counts = window(cache, o, (n, MAX_COUNTS))
+    o += n * MAX_COUNTS
+    return which, keys, turns, scatter, rows, counts, window(cache, o, (len(cache) - o,))
+
+
+@nb.njit(cache=True)
+def remembered_prior(z, numbers, cache):  # type: ignore[no-untyped-def]
+    """`log_prior` of a state; the part of each slot is kept with the numbers it was computed from."""
+    slots, value = window(cache, 4 * MAX_ARMS, (MAX_ARMS, ARM)), log_head(z, numbers)
+    if value == -math.inf:
+        return value
+    for a in range(MAX_ARMS):
+        o, known = HEAD + a * ARM, slots[a, 0] != 0.0
+        for j in range(1, ARM):
+            known = known and slots[a, j] == z[o + j]
+        if not known:
+            slots[a, 0] = log_slot(z, a, numbers)
+            for j in range(1, ARM):
+                slots[a, j] = z[o + j]
+        value += slots[a, 0]
+    return value
 
 
 @nb.njit(cache=True)
@@ -93,7 +111,7 @@ def lanes_of(z, field):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def coefficients_at(cell, floats, ints, room):  # type: ignore[no-untyped-def]
-    """[M20]'s halves for a cell of the centre, (18, 2 T); every cell is computed once."""
+    """[M20]'s halves for a cell of the centre, (19, 2 T); every cell is computed once."""
     halves, tracks = ints[NUM_HALVES], ints[NUM_TRACKS]
     known = room[:NUM_CELLS]
     o = NUM_CELLS
@@ -134,20 +152,9 @@ def point_score(z, floats, ints, counts):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
-def fill_side(coef, first, last, side, z, arm, stray, scatter, row):  # type: ignore[no-untyped-def]
-    """Costs of the halves of one side with one arm; lanes are summed where there are stray halves."""
-    num = arm[2] if side > 0 else arm[3]
-    if num < 0.5:
-        row[0, first:last] = density.NO_LANE
-        return
-    density.mean_row(coef, first, last, side, z[1], z[2], arm, scatter, row)
-    if len(stray) > 0:
-        density.sum_lanes_row(coef, first, last, arm[4], num, stray, row)
-
-
-@nb.njit(cache=True)
-def update_arms(z, coef, stray, cell, entries, which, keys, turns, scatter, rows):  # type: ignore[no-untyped-def]
-    """Make sure that the rows of all active slots for z are at hand, computing only what changed.
+def update_arms(z, coef, stray, cell, which, keys, turns, scatter, rows):  # type: ignore[no-untyped-def]
+    """Make sure that the rows of all active slots for z are at hand, computing only what changed; lanes are
+    summed where there are stray halves.
 
     cell counts from 1: the cache begins as zeros, and an arm at angle 0 must not be taken for known."""
     for a in range(int(z[0])):
@@ -164,46 +171,45 @@ def update_arms(z, coef, stray, cell, entries, which, keys, turns, scatter, rows
             if not (turns[turn, a, 0] == arm[0] and turns[turn, a, 1] == arm[5] and turns[turn, a, 2] == cell):
                 turn = 1 - turn
                 turns[turn, a, 0], turns[turn, a, 1], turns[turn, a, 2] = arm[0], arm[5], cell
-                density.scatter_row(coef, arm[0], arm[5], scatter[turn, a])
-            for side in range(2):
-                first, last = side_range(side, entries, coef.shape[1])
-                fill_side(coef, first, last, 1.0 - 2.0 * side, z, arm, stray, scatter[turn, a], rows[row, a])
+                turns[turn, a, 3], turns[turn, a, 4] = math.cos(arm[0]), math.sin(arm[0])
+                density.scatter_row(coef, turns[turn, a, 3], turns[turn, a, 4], arm[5], scatter[turn, a])
+            place = (z[1], z[2], turns[turn, a, 3], turns[turn, a, 4], arm)
+            density.mean_row(coef, *place, scatter[turn, a], rows[row, a])
+            if len(stray) > 0:
+                density.sum_lanes_row(coef, *place, stray, rows[row, a])
         which[1, a], which[3, a] = row, turn
 
 
 @nb.njit(cache=True)
 def exact_data(floats, halves):  # type: ignore[no-untyped-def]
-    """Coefficients (18, H) and costs of stray halves (H,) in the data of the exact likelihood."""
+    """Coefficients (19, H) and costs of stray halves (H,) in the data of the exact likelihood."""
     end = FLOATS + NUM_COEFFICIENTS * halves
-    return floats[FLOATS:end].reshape((NUM_COEFFICIENTS, halves)), floats[end : end + halves]
+    return window(floats, FLOATS, (NUM_COEFFICIENTS, halves)), window(floats, end, (halves,))
 
 
 def evaluate_exact(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     """out = (log prior, log likelihood) of a packed state, lane labels summed out."""
-    out[0], out[1] = log_prior(z, floats), -math.inf
+    out[0], out[1] = remembered_prior(z, floats, cache), -math.inf
     if out[0] == -math.inf:
         return
-    z, floats, cache = borrow(z), borrow(floats), borrow(cache)  # type: ignore[call-arg]
-    halves, entries, num = ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
+    z = window(z, 0, (SIZE,))  # type: ignore[call-arg]
+    halves, num = ints[NUM_HALVES], int(z[0])
     which, keys, turns, scatter, rows, _, room = memory(cache, halves)
     coef, stray = exact_data(floats, halves)
-    update_arms(z, coef, stray, 1.0, entries, which, keys, turns, scatter, rows)
+    update_arms(z, coef, stray, 1.0, which, keys, turns, scatter, rows)
     pick, low, second = which[1], room[:halves], room[halves : 2 * halves]
     density.two_lowest(rows, pick, num, low, second)
-    share = (floats[LOG_CLUTTER], floats[LOG_KEPT])
+    lanes, shares = (lanes_of(z, EXITS), lanes_of(z, ENTRIES)), (floats[LOG_CLUTTER], floats[LOG_KEPT])
     out[1] = floats[CONSTANT]
-    for side in range(2):
-        first, last = side_range(side, entries, halves)
-        lanes = lanes_of(z, ENTRIES + side)
-        out[1] += density.sum_arms(rows, pick, num, first, last, lanes, low, second, stray, *share)
+    out[1] += density.sum_arms(rows, pick, num, coef[SIDE], lanes, stray, *shares, low, second)
 
 
 def evaluate_closest(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     """out = (log prior, score) of a packed state, [M20]'s closest lanes for half tracks or points."""
-    out[0], out[1] = log_prior(z, floats), -math.inf
+    out[0], out[1] = remembered_prior(z, floats, cache), -math.inf
     if out[0] == -math.inf:
         return
-    z, floats, cache = borrow(z), borrow(floats), borrow(cache)  # type: ignore[call-arg]
+    z = window(z, 0, (SIZE,))  # type: ignore[call-arg]
     halves, entries, num = ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
     which, keys, turns, scatter, rows, counts, room = memory(cache, halves)
     if ints[LIKELIHOOD] == POINT:
@@ -211,20 +217,21 @@ def evaluate_closest(z, floats, ints, cache, out):  # type: ignore[no-untyped-de
         return
     cell = cell_of(z[1], z[2])
     coef = coefficients_at(cell, floats, ints, room)
-    update_arms(z, coef, floats[:0], cell + 1.0, entries, which, keys, turns, scatter, rows)
+    update_arms(z, coef, floats[:0], cell + 1.0, which, keys, turns, scatter, rows)
     out[1] = floats[CONSTANT]
+    arms = z[HEAD:].reshape((MAX_ARMS, ARM))
     for side in range(2):
         first, last = side_range(side, entries, halves)
         lanes = lanes_of(z, ENTRIES + side)
-        out[1] += density.closest_arms(coef[W_ACROSS], rows, which[1], num, first, last, lanes, counts)
+        out[1] += density.closest_arms(coef, z[1], z[2], arms, rows, which[1], num, first, last, lanes, counts)
 
 
 @nb.njit(cache=True)
-def newton(z, coef, stray, entries, rows, pick, floats):  # type: ignore[no-untyped-def]
+def newton(z, coef, stray, rows, pick, floats):  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of the continuous numbers, in place."""
     size = 2 + FREE * int(z[0])
     hessian, gradient = np.empty((size, size)), np.empty(size)
-    quadratic_model(z, coef, entries, stray, rows, pick, floats, hessian, gradient)
+    quadratic_model(z, coef, stray, rows, pick, floats, hessian, gradient)
     if solve_spd(hessian, gradient, size):
         take_step(z, gradient, floats[GAP_MAX])
 
@@ -233,14 +240,14 @@ def refit_exact(z, floats, ints, cache):  # type: ignore[no-untyped-def]
     """A Gauss-Newton step; the cache holds z evaluated last."""
     which, _, _, _, rows, _, _ = memory(cache, ints[NUM_HALVES])
     coef, stray = exact_data(floats, ints[NUM_HALVES])
-    newton(z, coef, stray, ints[NUM_ENTRIES], rows, which[1], floats)
+    newton(z, coef, stray, rows, which[1], floats)
 
 
 def refit_half(z, floats, ints, cache):  # type: ignore[no-untyped-def]
     """A Gauss-Newton step with [M20]'s halves; the cache holds z evaluated last."""
     which, _, _, _, rows, _, room = memory(cache, ints[NUM_HALVES])
     coef = coefficients_at(cell_of(z[1], z[2]), floats, ints, room)
-    newton(z, coef, np.full(ints[NUM_HALVES], density.NO_LANE), ints[NUM_ENTRIES], rows, which[1], floats)
+    newton(z, coef, np.full(ints[NUM_HALVES], density.NO_LANE), rows, which[1], floats)
 
 
 def commit(cache):  # type: ignore[no-untyped-def]

@@ -103,14 +103,15 @@ def along_moments(s, starts):  # type: ignore[no-untyped-def]
 
 
 # rows of the coefficients that the density reads, see `coefficients`
-X, Y, S, T, PHI, W_ACROSS, W_ALONG, W_HEADING = range(8)
-A0, A_XX, A_YY, A_XY, A_X, A_Y, A_KY, A_KX, A_K, A_KK = range(8, 18)
-NUM_COEFFICIENTS = 18
+X, Y, S, T, SIDE, OUTGOING, W_ACROSS, W_ALONG, W_HEADING = range(9)
+A0, A_XX, A_YY, A_XY, A_X, A_Y, A_KY, A_KX, A_K, A_KK = range(9, 19)
+NUM_COEFFICIENTS = 19
 
 
 @nb.njit(cache=True)
-def coefficients(observed, fixed, position, along, offset, phase, heading, out):  # type: ignore[no-untyped-def]
-    """Moments scaled by the noise, (18, H): five means, three weights of the mean residuals, and
+def coefficients(observed, fixed, entries, position, along, offset, phase, heading, out):  # type: ignore[no-untyped-def]
+    """Moments scaled by the noise, (19, H): four means, side (+1 for the first `entries` halves, -1 for the rest),
+    the mean heading as seen by somebody driving out, three weights of the mean residuals, and
 
         scatter cost(d, kappa) = A0 + dx^2 A_XX + dy^2 A_YY + dx dy A_XY + dx A_X + dy A_Y
                                  + kappa (dy A_KY - dx A_KX + A_K) + kappa^2 A_KK
@@ -120,7 +121,9 @@ def coefficients(observed, fixed, position, along, offset, phase, heading, out):
     head2 = 0.5 / heading**2
     for h in range(observed.shape[1]):
         n = fixed[COUNT, h]
-        out[X, h], out[Y, h], out[PHI, h] = observed[MX, h], observed[MY, h], observed[MPHI, h]
+        out[X, h], out[Y, h] = observed[MX, h], observed[MY, h]
+        out[SIDE, h] = 1.0 if h < entries else -1.0
+        out[OUTGOING, h] = observed[MPHI, h] - (math.pi if h < entries else 0.0)
         out[S, h], out[T, h] = fixed[MS, h], fixed[MT, h]
         out[W_ACROSS, h] = n / (position**2 + n * offset**2)
         out[W_ALONG, h] = n / (along**2 + n * phase**2) if along2 > 0.0 else 0.0

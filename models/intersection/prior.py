@@ -66,8 +66,8 @@ def apart(z, num, angle, skip):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
-def log_prior(z, numbers):  # type: ignore[no-untyped-def]
-    """log p(z) of a packed state, inactive slots included (pseudo-priors)."""
+def log_head(z, numbers):  # type: ignore[no-untyped-def]
+    """log density of the number of arms, the centre and the angles of all slots."""
     num = int(z[0])
     if not MIN_ARMS <= num <= MAX_ARMS:
         return -math.inf
@@ -75,7 +75,13 @@ def log_prior(z, numbers):  # type: ignore[no-untyped-def]
         if not apart(z, a, z[HEAD + a * ARM + ANGLE], a):
             return -math.inf
     value = numbers[LOG_HEAD] - (num - 1.0) * math.log1p(-num * MIN_SEPARATION / (2.0 * math.pi))
-    value -= square(z[1], numbers[CENTRE_STD]) + square(z[2], numbers[CENTRE_STD])
+    return value - square(z[1], numbers[CENTRE_STD]) - square(z[2], numbers[CENTRE_STD])
+
+
+@nb.njit(cache=True)
+def log_prior(z, numbers):  # type: ignore[no-untyped-def]
+    """log p(z) of a packed state, inactive slots included (pseudo-priors)."""
+    value = log_head(z, numbers)
     for a in range(MAX_ARMS):
         value += log_slot(z, a, numbers)
     return value

@@ -17,7 +17,7 @@ import numba as nb
 import numpy as np
 
 from models.intersection import moments as mo
-from models.intersection.density import NO_LANE
+from models.intersection.density import NO_LANE, lane_number
 from models.intersection.moments import CHORD
 from models.intersection.moves import LEVER
 from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, SHIFT, WIDTH
@@ -33,6 +33,7 @@ from models.intersection.prior import (
 from models.intersection.wrap import wrap
 
 FREE = 5  # continuous numbers of an arm
+LOCAL = 2 + FREE  # those that the cost of a half on an arm depends on
 FREE_FIELDS = np.array([ANGLE, GAP, WIDTH, BEND, SHIFT])
 LEAST_WIDTH = 0.5  # [m]
 FARTHEST = np.array([0.1, 1.5, 0.5, 0.005, 1.0])  # largest step of each
@@ -87,48 +88,59 @@ def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def add_square(hessian, gradient, where, slopes, residual, weight):  # type: ignore[no-untyped-def]
-    """Add weight / 2 residual^2 to the quadratic model, lower triangle; `where` the unknowns, in rising order."""
-    for i in range(len(where)):
+def add_square(block, slopes, first, last, residual, weight):  # type: ignore[no-untyped-def]
+    """Add weight / 2 residual^2, sloping in unknowns first:last of an arm, to its block: hessian, gradient on top."""
+    for i in range(first, last):
         pull = weight * slopes[i]
-        gradient[where[i]] += residual * pull
-        for j in range(i + 1):
-            hessian[where[i], where[j]] += pull * slopes[j]
+        block[LOCAL, i] += residual * pull
+        for j in range(first, i + 1):
+            block[i, j] += pull * slopes[j]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def add_half(coef, h, side, lane, z, arm, dx, dy, hessian, gradient, where, slopes):  # type: ignore[no-untyped-def]
-    """Add the cost of one half track on one lane of an arm with direction (dx, dy)."""
+def add_half(coef, h, lane, z, arm, dx, dy, block, slopes):  # type: ignore[no-untyped-def]
+    """Add the cost of one half track on one lane of an arm with direction (dx, dy) to the arm's block.
+
+    block (LOCAL + 1, LOCAL) lower triangle over (c; angle, gap, width, bend, shift), then the gradient"""
     o = HEAD + arm * ARM
-    bend = z[o + BEND]
+    bend, side = z[o + BEND], coef[mo.SIDE, h]
     rx, ry = coef[mo.X, h] - z[1], coef[mo.Y, h] - z[2]
     across, along = -dy * rx + dx * ry, dx * rx + dy * ry
-    first = 2 + FREE * arm
-    where[0], where[1] = 0, 1
-    for j in range(FREE):
-        where[2 + j] = first + j
     slopes[0], slopes[1], slopes[2] = dy, -dx, -along
     slopes[3], slopes[4], slopes[5], slopes[6] = -0.5 * side, -side * (lane + 0.5), -coef[mo.T, h], -1.0
     target = z[o + SHIFT] + bend * coef[mo.T, h] + side * (0.5 * z[o + GAP] + (lane + 0.5) * z[o + WIDTH])
-    add_square(hessian, gradient, where, slopes, across - target, coef[mo.W_ACROSS, h])
+    add_square(block, slopes, 0, LOCAL, across - target, coef[mo.W_ACROSS, h])
     if coef[mo.W_ALONG, h] > 0.0:
         slopes[0], slopes[1], slopes[2] = -dx, -dy, across
-        add_square(hessian, gradient, where[:3], slopes, along - coef[mo.S, h], coef[mo.W_ALONG, h])
+        add_square(block, slopes, 0, 3, along - coef[mo.S, h], coef[mo.W_ALONG, h])
     if coef[mo.W_HEADING, h] > 0.0:
-        turn = coef[mo.PHI, h] - z[o + ANGLE] - (math.pi if side > 0 else 0.0) - bend * (coef[mo.S, h] - 0.5 * CHORD)
-        slopes[2], slopes[5] = -1.0, -(coef[mo.S, h] - 0.5 * CHORD)
-        slopes[3] = slopes[4] = 0.0
-        add_square(hessian, gradient, where[2:6], slopes[2:6], wrap(turn), coef[mo.W_HEADING, h])
-    a, b = first, first + 3  # scatter: angle and bend
+        lever = coef[mo.S, h] - 0.5 * CHORD
+        slopes[2], slopes[3], slopes[4], slopes[5] = -1.0, 0.0, 0.0, -lever
+        turn = wrap(coef[mo.OUTGOING, h] - z[o + ANGLE] - bend * lever)
+        add_square(block, slopes, 2, 6, turn, coef[mo.W_HEADING, h])
+    a, b = 2, 5  # scatter: angle and bend
     twist = dx * coef[mo.A_KY, h] + dy * coef[mo.A_KX, h]
-    gradient[a] += 2 * dx * dy * (coef[mo.A_YY, h] - coef[mo.A_XX, h]) + (dx * dx - dy * dy) * coef[mo.A_XY, h]
-    gradient[a] += dx * coef[mo.A_Y, h] - dy * coef[mo.A_X, h] + bend * twist
-    gradient[b] += dy * coef[mo.A_KY, h] - dx * coef[mo.A_KX, h] + coef[mo.A_K, h] + 2 * bend * coef[mo.A_KK, h]
+    block[LOCAL, a] += 2 * dx * dy * (coef[mo.A_YY, h] - coef[mo.A_XX, h]) + (dx * dx - dy * dy) * coef[mo.A_XY, h]
+    block[LOCAL, a] += dx * coef[mo.A_Y, h] - dy * coef[mo.A_X, h] + bend * twist
+    block[LOCAL, b] += dy * coef[mo.A_KY, h] - dx * coef[mo.A_KX, h] + coef[mo.A_K, h] + 2 * bend * coef[mo.A_KK, h]
     curve = 2 * (dx * dx - dy * dy) * (coef[mo.A_YY, h] - coef[mo.A_XX, h]) - 4 * dx * dy * coef[mo.A_XY, h]
     curve -= dx * coef[mo.A_X, h] + dy * coef[mo.A_Y, h]
-    hessian[a, a] += max(curve, 0.0)
-    hessian[b, a] += twist
-    hessian[b, b] += 2 * coef[mo.A_KK, h]
+    block[a, a] += max(curve, 0.0)
+    block[b, a] += twist
+    block[b, b] += 2 * coef[mo.A_KK, h]
+
+
+@nb.njit(cache=True, error_model="numpy")
+def assemble(blocks, hessian, gradient):  # type: ignore[no-untyped-def]
+    """The model of all unknowns, (c; five of every arm), from the blocks of the arms."""
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    for a in range(len(blocks)):
+        for i in range(LOCAL):
+            row = i if i < 2 else i + FREE * a
+            gradient[row] += blocks[a, LOCAL, i]
+            for j in range(i + 1):
+                hessian[row, j if j < 2 else j + FREE * a] += blocks[a, i, j]
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -189,25 +201,23 @@ def solve_spd(matrix, vector, n):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def quadratic_model(z, coef, entries, stray, rows, pick, floats, hessian, gradient):  # type: ignore[no-untyped-def]
+def quadratic_model(z, coef, stray, rows, pick, floats, hessian, gradient):  # type: ignore[no-untyped-def]
     """Hessian (lower triangle) and gradient of -log p at z, halves on their closest lanes; stray halves say nothing."""
     num = int(z[0])
-    where, slopes = np.zeros(7, np.int64), np.zeros(7)
-    directions = np.empty((num, 2))
+    blocks, slopes, directions = np.zeros((num, LOCAL + 1, LOCAL)), np.empty(LOCAL), np.empty((num, 2))
     for a in range(num):
         angle = z[HEAD + a * ARM + ANGLE]
         directions[a, 0], directions[a, 1] = math.cos(angle), math.sin(angle)
-    hessian[:] = 0.0
-    gradient[:] = 0.0
     for h in range(coef.shape[1]):
         low, arm = NO_LANE, num
         for a in range(num):
-            if rows[int(pick[a]), a, 0, h] < low:
-                low, arm = rows[int(pick[a]), a, 0, h], a
+            if rows[int(pick[a]), a, h] < low:
+                low, arm = rows[int(pick[a]), a, h], a
         if low < NO_LANE and low < stray[h]:
-            side, lane = 1.0 if h < entries else -1.0, rows[int(pick[arm]), arm, 1, h]
+            lane = lane_number(coef, h, z[1], z[2], z[HEAD + arm * ARM : HEAD + (arm + 1) * ARM])
             dx, dy = directions[arm, 0], directions[arm, 1]
-            add_half(coef, h, side, lane, z, arm, dx, dy, hessian, gradient, where, slopes)
+            add_half(coef, h, lane, z, arm, dx, dy, blocks[arm], slopes)
+    assemble(blocks, hessian, gradient)
     add_prior(z, floats, hessian, gradient)
 
 

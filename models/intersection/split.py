@@ -65,7 +65,7 @@ def half_ranges(table, offsets, cell, margin, begin, end):  # type: ignore[no-un
 
 @nb.njit(cache=True)
 def cell_coefficients(sums, offsets, begin, end, position, heading, observed, fixed, out):  # type: ignore[no-untyped-def]
-    """Coefficients (18, 2 T) of straight lanes for halves begin:end, from differences of the running sums."""
+    """Coefficients (19, 2 T) of straight lanes for halves begin:end, from differences of the running sums."""
     num = len(offsets) - 1
     observed[:] = 0.0
     fixed[:] = 0.0
@@ -83,4 +83,4 @@ def cell_coefficients(sums, offsets, begin, end, position, heading, observed, fi
         observed[mo.CXY, h] = d[4] - n * mx * my
         observed[mo.CYY, h] = d[5] - n * my * my
         observed[mo.CPP, h] = d[7] - n * mp * mp
-    mo.coefficients(observed, fixed, position, np.inf, 0.0, np.inf, heading, out)
+    mo.coefficients(observed, fixed, num, position, np.inf, 0.0, np.inf, heading, out)

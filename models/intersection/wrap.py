@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
 
 
 @nb.njit(cache=True)
 def wrap(angle):  # type: ignore[no-untyped-def]
     """An angle in [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)
+    return angle - 2.0 * math.pi * np.floor(angle / (2.0 * math.pi) + 0.5)

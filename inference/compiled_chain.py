@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from inference.acceptance import log_acceptance
 from inference.polish import polish
 from models.capability import Kernel, kernel_types, pointer
+from models.overwrite import overwrite
 
 Array = NDArray[Any]
 acceptance = nb.njit(log_acceptance)
@@ -49,11 +50,13 @@ def _chain(  # type: ignore[no-untyped-def]
             if np.log(uniforms[i, 1]) < log_ratio:
                 counts[kind, 2] += 1
                 commit(cache)
-                z[:], log_terms[:] = z_new, out
+                overwrite(z, z_new)
+                overwrite(log_terms, out)
                 if out[0] + out[1] > best[-1]:
-                    best[:-1], best[-1] = z, out[0] + out[1]
+                    overwrite(best, z)
+                    best[-1] = out[0] + out[1]
         if i == due:
-            draws[row] = z
+            overwrite(draws[row], z)
             due, row = due + int(setup[2]), row + 1
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.capability import Kernel, kernel_types, pointer
+from models.overwrite import overwrite
 
 REFITS = 12  # Gauss-Newton steps after an edit, at most
 PATIENCE = 2  # refits after which an edit must be close to the best
@@ -37,7 +38,8 @@ def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, sco
                 value = out[0] + out[1]
                 gain = value - top
                 if gain > 0.0:
-                    top, best[:] = value, trial
+                    top = value
+                    overwrite(best, trial)
                 if not np.isfinite(value) or (step > 0 and top < score[0] - HOPELESS):
                     break
                 if step >= PATIENCE and (top < score[0] - CLOSE or gain < SETTLED):
@@ -45,7 +47,8 @@ def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, sco
                 refit(trial, floats, ints, cache)
             idle = 0 if top > score[0] + WORTH and index >= 0 else idle
             if top > score[0] + 1e-6:
-                score[0], z[:] = top, best
+                score[0] = top
+                overwrite(z, best)
                 evaluate(z, floats, ints, cache, out)
                 commit(cache)
         index, idle = (index + 1) % num_edits, idle + 1

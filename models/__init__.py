@@ -10,7 +10,8 @@ def _compiled_code_folder() -> str:
     """One folder of compiled code for each state of the sources.
 
     numba looks only at the file of a function when it asks whether its machine code is still good, not at the files of
-    the functions it calls: after an edit it would run old mathematics."""
+    the functions it calls: after an edit it would run old mathematics. For speed, only functions that Python calls
+    are kept (cache=True): one that is loaded from the disk cannot be inlined into its machine-code callers."""
     root = Path(__file__).resolve().parent.parent
     digest = hashlib.sha256()
     for path in sorted(p for package in ("models", "inference") for p in (root / package).rglob("*.py")):

@@ -50,7 +50,7 @@ LOG_FACTORIAL = np.array([math.lgamma(n + 1.0) for n in range(256)])
 FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def scatter_row(coef, dx, dy, bend, out):  # type: ignore[no-untyped-def]
     """Cost of the scatter of every half track around lanes of direction (dx, dy) and this bend, (H,)."""
     xx, yy, xy = dx * dx, dy * dy, dx * dy
@@ -61,7 +61,7 @@ def scatter_row(coef, dx, dy, bend, out):  # type: ignore[no-untyped-def]
         out[h] = straight + ky * coef[A_KY, h] - kx * coef[A_KX, h] + bend * coef[A_K, h] + kk * coef[A_KK, h]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def closest_lane(beyond, width, top):  # type: ignore[no-untyped-def]
     """Number of the lane, 0 the innermost and `top` the outermost, whose middle is closest."""
     k = np.floor(beyond / width + 0.5)  # math.floor would make a whole number of it and back
@@ -69,28 +69,27 @@ def closest_lane(beyond, width, top):  # type: ignore[no-untyped-def]
     return k if k < top else top
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def beyond_innermost(coef, h, dx, dy, axis, arm):  # type: ignore[no-untyped-def]
     """Distance of a half from the middle of the innermost lane of an arm of direction (dx, dy), outwards [m]."""
     across = -dy * coef[X, h] + dx * coef[Y, h] - axis - arm[5] * coef[T, h]
     return coef[SIDE, h] * across - 0.5 * arm[1] - 0.5 * arm[4]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def axis_of(dx, dy, cx, cy, arm):  # type: ignore[no-untyped-def]
     """Distance of the axis of an arm of direction (dx, dy) from the origin, to the left [m]."""
     return -dy * cx + dx * cy + arm[6]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def lane_number(coef, h, cx, cy, arm):  # type: ignore[no-untyped-def]
-    """Number of the lane of an arm that is closest to a half, 0 the innermost."""
-    dx, dy = math.cos(arm[0]), math.sin(arm[0])
+@nb.njit(fastmath=FAST, error_model="numpy")
+def lane_number(coef, h, cx, cy, dx, dy, arm):  # type: ignore[no-untyped-def]
+    """Number of the lane of an arm of direction (dx, dy) that is closest to a half, 0 the innermost."""
     top = arm[2] - 1.0 if coef[SIDE, h] > 0.0 else arm[3] - 1.0
     return closest_lane(beyond_innermost(coef, h, dx, dy, axis_of(dx, dy, cx, cy, arm), arm), arm[4], top)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def mean_row(coef, cx, cy, dx, dy, arm, scatter, cost):  # type: ignore[no-untyped-def]
     """Cost of every half track with its closest lane of an arm, (H,); NO_LANE where it has none of the side.
 
@@ -111,7 +110,7 @@ def mean_row(coef, cx, cy, dx, dy, arm, scatter, cost):  # type: ignore[no-untyp
         cost[h] = value if top >= 0.0 else NO_LANE
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def sum_lanes_row(coef, cx, cy, dx, dy, arm, stray, cost):  # type: ignore[no-untyped-def]
     """Turn the cost of the closest lane of an arm into -log sum over its lanes of exp(-cost), (H,).
 
@@ -143,7 +142,7 @@ def sum_lanes_row(coef, cx, cy, dx, dy, arm, stray, cost):  # type: ignore[no-un
             cost[h] -= math.log1p(extra)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def two_lowest(rows, pick, num_arms, low, second):  # type: ignore[no-untyped-def]
     """The lowest and the second lowest cost of every half over the arms, (H,)."""
     low[:] = NO_LANE
@@ -157,7 +156,7 @@ def two_lowest(rows, pick, num_arms, low, second):  # type: ignore[no-untyped-de
             second[h] = above if above < second[h] else second[h]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def best_alone(side, labels, shares, stray, low, second):  # type: ignore[no-untyped-def]
     """Log likelihood as if every half were where it is best; `second` becomes what its next best place costs more.
 
@@ -173,7 +172,7 @@ def best_alone(side, labels, shares, stray, low, second):  # type: ignore[no-unt
     return total
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def sum_arms(rows, pick, num_arms, side, lanes, stray, log_clutter, log_kept, low, second):  # type: ignore[no-untyped-def]
     """Log likelihood of all halves, labels summed out.
 
@@ -202,7 +201,7 @@ def sum_arms(rows, pick, num_arms, side, lanes, stray, log_clutter, log_kept, lo
     return total
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def closest_arms(coef, cx, cy, arms, rows, pick, num_arms, first, last, num_lanes, counts):  # type: ignore[no-untyped-def]
     """Score of halves first:last of one side with the closest lane each and multinomial counts.
 
@@ -222,11 +221,12 @@ def closest_arms(coef, cx, cy, arms, rows, pick, num_arms, first, last, num_lane
             if value < low:
                 low, arm = value, a
         total -= low
-        counts[arm, int(lane_number(coef, h, cx, cy, arms[arm]))] += 1.0
+        dx, dy = math.cos(arms[arm, 0]), math.sin(arms[arm, 0])
+        counts[arm, int(lane_number(coef, h, cx, cy, dx, dy, arms[arm]))] += 1.0
     return total + multinomial(counts, num_lanes)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def multinomial(counts, num_lanes):  # type: ignore[no-untyped-def]
     """log T! - sum log n! - T log L of the track counts per lane."""
     tracks, total = 0.0, 0.0
@@ -239,7 +239,7 @@ def multinomial(counts, num_lanes):  # type: ignore[no-untyped-def]
     return total + math.lgamma(tracks + 1.0) - tracks * math.log(num_lanes)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def closest_points(points, begin, end, first, last, side, cx, cy, arms, num_arms, num_lanes, noise, counts):  # type: ignore[no-untyped-def]
     """Score of halves first:last of one side, every point with its closest lane ([M20] III-B).
 

@@ -93,7 +93,7 @@ def crossing(path, offsets):  # type: ignore[no-untyped-def]
     return np.array([(d * u - b * v) / det, (a * v - b * u) / det])
 
 
-@nb.njit(cache=True)
+@nb.njit
 def closest_index(path, first, last, x, y):  # type: ignore[no-untyped-def]
     """Index of the point of path[first:last] closest to (x, y): every sixth, then around the best."""
     best, index = 1e300, first
@@ -108,7 +108,7 @@ def closest_index(path, first, last, x, y):  # type: ignore[no-untyped-def]
     return index
 
 
-@nb.njit(cache=True)
+@nb.njit
 def straight_end(turn, outer, inner, margin):  # type: ignore[no-untyped-def]
     """How far in from its outer end a half track keeps its direction: the first index that is left out.
 

@@ -58,7 +58,7 @@ def memory_size(ints):  # type: ignore[no-untyped-def]
     return size
 
 
-@nb.njit(cache=True)
+@nb.njit
 def memory(cache, halves):  # type: ignore[no-untyped-def]
     """Named views of the cache: which row of each slot is current and which is evaluated, for rows and for their
     scatter; the numbers each was computed from; scatter (2, A, H); costs (2, A, H); counts; room."""
@@ -77,7 +77,7 @@ def memory(cache, halves):  # type: ignore[no-untyped-def]
     return which, keys, turns, scatter, rows, counts, window(cache, o, (len(cache) - o,))
 
 
-@nb.njit(cache=True)
+@nb.njit
 def remembered_prior(z, numbers, cache):  # type: ignore[no-untyped-def]
     """`log_prior` of a state; the part of each slot is kept with the numbers it was computed from."""
     slots, value = window(cache, 4 * MAX_ARMS, (MAX_ARMS, ARM)), log_head(z, numbers)
@@ -95,13 +95,13 @@ def remembered_prior(z, numbers, cache):  # type: ignore[no-untyped-def]
     return value
 
 
-@nb.njit(cache=True)
+@nb.njit
 def side_range(side, entries, halves):  # type: ignore[no-untyped-def]
     """First and last half of the entries (side 0) or the exits (side 1)."""
     return (0, entries) if side == 0 else (entries, halves)
 
 
-@nb.njit(cache=True)
+@nb.njit
 def lanes_of(z, field):  # type: ignore[no-untyped-def]
     total = 0.0
     for a in range(int(z[0])):
@@ -109,7 +109,7 @@ def lanes_of(z, field):  # type: ignore[no-untyped-def]
     return total
 
 
-@nb.njit(cache=True)
+@nb.njit
 def coefficients_at(cell, floats, ints, room):  # type: ignore[no-untyped-def]
     """[M20]'s halves for a cell of the centre, (19, 2 T); every cell is computed once."""
     halves, tracks = ints[NUM_HALVES], ints[NUM_TRACKS]
@@ -132,7 +132,7 @@ def coefficients_at(cell, floats, ints, room):  # type: ignore[no-untyped-def]
     return coef
 
 
-@nb.njit(cache=True)
+@nb.njit
 def point_score(z, floats, ints, counts):  # type: ignore[no-untyped-def]
     """[M20] as printed: every point with its closest lane, halves split at the centre."""
     tracks, halves = ints[NUM_TRACKS], ints[NUM_HALVES]
@@ -151,7 +151,7 @@ def point_score(z, floats, ints, counts):  # type: ignore[no-untyped-def]
     return score
 
 
-@nb.njit(cache=True)
+@nb.njit
 def update_arms(z, coef, stray, cell, which, keys, turns, scatter, rows):  # type: ignore[no-untyped-def]
     """Make sure that the rows of all active slots for z are at hand, computing only what changed; lanes are
     summed where there are stray halves.
@@ -180,7 +180,7 @@ def update_arms(z, coef, stray, cell, which, keys, turns, scatter, rows):  # typ
         which[1, a], which[3, a] = row, turn
 
 
-@nb.njit(cache=True)
+@nb.njit
 def exact_data(floats, halves):  # type: ignore[no-untyped-def]
     """Coefficients (19, H) and costs of stray halves (H,) in the data of the exact likelihood."""
     end = FLOATS + NUM_COEFFICIENTS * halves
@@ -226,7 +226,7 @@ def evaluate_closest(z, floats, ints, cache, out):  # type: ignore[no-untyped-de
         out[1] += density.closest_arms(coef, z[1], z[2], arms, rows, which[1], num, first, last, lanes, counts)
 
 
-@nb.njit(cache=True)
+@nb.njit
 def newton(z, coef, stray, rows, pick, floats):  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of the continuous numbers, in place."""
     size = 2 + FREE * int(z[0])

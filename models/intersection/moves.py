@@ -37,6 +37,7 @@ from models.intersection.prior import (
     log_slot,
 )
 from models.intersection.wrap import wrap
+from models.overwrite import overwrite
 
 ROTATE, CENTRE, CHANGE_GAP, ARMS, LANES, TOGGLE, SCALE_WIDTH, CHANGE_BEND, CHANGE_SHIFT, PIVOT = range(10)
 NAMES = ("rotate", "centre", "gap", "arms", "lanes", "toggle", "width", "bend", "shift", "pivot")
@@ -52,14 +53,14 @@ WALK_SIZE = np.array([math.radians(6.0), 0.0, 1.8, 0.0, 0.0, 0.0, 0.0, 0.004, 1.
 LEVER = 45.0  # [m] mean distance of the points from the centre: turns a lateral step into a rotation
 
 
-@nb.njit(cache=True)
+@nb.njit
 def split_choice(u, n):  # type: ignore[no-untyped-def]
     """u = (k + r) / n: the choice k of n and the uniform remainder r."""
     k = min(int(u * n), n - 1)
     return k, u * n - k
 
 
-@nb.njit(cache=True)
+@nb.njit
 def step_scale(u, settings):  # type: ignore[no-untyped-def]
     """Length of a step relative to [M20]'s."""
     if settings[SMALL_STEPS] == 0.0 or u < 0.3:
@@ -67,12 +68,12 @@ def step_scale(u, settings):  # type: ignore[no-untyped-def]
     return math.exp(-3.5 * (u - 0.3) / 0.7)
 
 
-@nb.njit(cache=True)
+@nb.njit
 def normal_cdf(x):  # type: ignore[no-untyped-def]
     return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
-@nb.njit(cache=True)
+@nb.njit
 def normal_quantile(u):  # type: ignore[no-untyped-def]
     """x with normal_cdf(x) = u, by Halley's iteration from the logistic approximation."""
     if u > 0.5:
@@ -80,7 +81,7 @@ def normal_quantile(u):  # type: ignore[no-untyped-def]
     return normal_quantile_low(u)
 
 
-@nb.njit(cache=True)
+@nb.njit
 def normal_quantile_low(u):  # type: ignore[no-untyped-def]
     u = max(u, 1e-300)
     x = math.log(u / (1.0 - u)) / 1.702 if u > 1e-3 else -math.sqrt(-2.0 * math.log(u))
@@ -93,7 +94,7 @@ def normal_quantile_low(u):  # type: ignore[no-untyped-def]
     return x
 
 
-@nb.njit(cache=True)
+@nb.njit
 def insertion_sort(values):  # type: ignore[no-untyped-def]
     """Sort in place; for a handful, and quick to compile."""
     for i in range(1, len(values)):
@@ -104,7 +105,7 @@ def insertion_sort(values):  # type: ignore[no-untyped-def]
         values[j + 1] = value
 
 
-@nb.njit(cache=True)
+@nb.njit
 def free_angles(z, num, out):  # type: ignore[no-untyped-def]
     """Angles at least MIN_SEPARATION from all `num` active arms: their measure; `out` the sorted arms."""
     for a in range(num):
@@ -117,7 +118,7 @@ def free_angles(z, num, out):  # type: ignore[no-untyped-def]
     return total
 
 
-@nb.njit(cache=True)
+@nb.njit
 def free_angle(u, total, num, arms):  # type: ignore[no-untyped-def]
     """The free angle below which a share u of the free angles lies."""
     left = u * total
@@ -130,7 +131,7 @@ def free_angle(u, total, num, arms):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@nb.njit(cache=True)
+@nb.njit
 def free_share(angle, total, num, arms):  # type: ignore[no-untyped-def]
     """The share of the free angles that lies below a free angle: the inverse of `free_angle`."""
     below = 0.0
@@ -144,14 +145,14 @@ def free_share(angle, total, num, arms):  # type: ignore[no-untyped-def]
     return 1.0
 
 
-@nb.njit(cache=True)
+@nb.njit
 def swap_slots(z, a, b):  # type: ignore[no-untyped-def]
     for j in range(ARM):
         i, k = HEAD + a * ARM + j, HEAD + b * ARM + j
         z[i], z[k] = z[k], z[i]
 
 
-@nb.njit(cache=True)
+@nb.njit
 def redraw_slot(z, a, settings, u, u_new):  # type: ignore[no-untyped-def]
     """Swap a slot's numbers but its angle with fresh ones from the prior; the old ones travel in u_new.
 
@@ -181,7 +182,7 @@ def redraw_slot(z, a, settings, u, u_new):  # type: ignore[no-untyped-def]
         z[o + SHIFT] = settings[SHIFT_STD] * normal_quantile(u[8])
 
 
-@nb.njit(cache=True)
+@nb.njit
 def change_arms(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """Add an arm at a free angle (u[0] < 1/2) or remove a uniform one."""
     num, birth = int(z[0]), u[0] < 0.5
@@ -216,7 +217,7 @@ def change_arms(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped
     return True
 
 
-@nb.njit(cache=True)
+@nb.njit
 def change_lanes(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """Add an outer lane on a side of a uniform arm (u[0] < 1/2), or remove one of all lanes.
 
@@ -261,7 +262,7 @@ def change_lanes(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untype
     return lanes_fit(z_new[HEAD + arm * ARM + ENTRIES], z_new[HEAD + arm * ARM + EXITS], settings)
 
 
-@nb.njit(cache=True)
+@nb.njit
 def toggle(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """Give or take inner lanes of a uniform arm; the other lanes stay where they are.
 
@@ -297,7 +298,7 @@ def toggle(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     return fits and inside and apart(z_new, int(z[0]), z_new[o + ANGLE], arm)
 
 
-@nb.njit(cache=True)
+@nb.njit
 def scale_width(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """Scale the lane width of a uniform arm: w' = w exp(t); Jacobian w' / w."""
     arm, _ = split_choice(u[0], int(z[0]))
@@ -313,7 +314,7 @@ def scale_width(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped
     return 0.0 <= z_new[o + GAP] <= settings[GAP_MAX]
 
 
-@nb.njit(cache=True)
+@nb.njit
 def walk_field(kind, z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """Uniform walk of one field of a uniform arm, within what the field may be."""
     arm, _ = split_choice(u[0], int(z[0]))
@@ -328,7 +329,7 @@ def walk_field(kind, z, u, settings, z_new, u_new, log_q):  # type: ignore[no-un
     return field != GAP or 0.0 <= z_new[o] <= settings[GAP_MAX]
 
 
-@nb.njit(cache=True)
+@nb.njit
 def shift_centre(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """Shift the centre by a uniform radius in a uniform direction; the reverse points back."""
     size = MAX_CENTRE * step_scale(u[1], settings)
@@ -338,7 +339,7 @@ def shift_centre(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untype
     log_q[0] = log_q[1] = -math.log(size * 2.0 * math.pi)
 
 
-@nb.njit(cache=True)
+@nb.njit
 def pivot(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """Shift the centre by delta while the arms stay where their points are.
 
@@ -374,8 +375,8 @@ def pivot(z, u, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
 
 def propose(kind, z, u, floats, ints, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """One involution; returns False where the step leaves the state space."""
-    z_new[:] = z
-    u_new[:] = u
+    overwrite(z_new, z)
+    overwrite(u_new, u)
     log_q[:] = 0.0
     if kind == CENTRE:
         shift_centre(z, u, floats, z_new, u_new, log_q)

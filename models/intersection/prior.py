@@ -29,20 +29,20 @@ def prior_numbers(
     return [*settings, log_head, log_slot, log_some, log_any]
 
 
-@nb.njit(cache=True, fastmath={"arcp", "contract"}, error_model="numpy")
+@nb.njit(fastmath={"arcp", "contract"}, error_model="numpy")
 def square(x, std):  # type: ignore[no-untyped-def]
     """(x / std)^2 / 2; zero where std = 0: the value is a constant."""
     return 0.5 * (x / std) ** 2 if std > 0.0 else 0.0
 
 
-@nb.njit(cache=True)
+@nb.njit
 def lanes_fit(entries, exits, numbers):  # type: ignore[no-untyped-def]
     """Whether an arm may have these lane counts."""
     low, high = numbers[MIN_LANES], numbers[MAX_LANES]
     return low <= entries <= high and low <= exits <= high and entries + exits >= 1.0
 
 
-@nb.njit(cache=True, fastmath={"arcp", "contract"}, error_model="numpy")
+@nb.njit(fastmath={"arcp", "contract"}, error_model="numpy")
 def log_slot(z, a, numbers):  # type: ignore[no-untyped-def]
     """log density of a slot but for its angle."""
     o = HEAD + a * ARM
@@ -55,7 +55,7 @@ def log_slot(z, a, numbers):  # type: ignore[no-untyped-def]
     return value - square(z[o + BEND], numbers[BEND_STD]) - square(z[o + SHIFT], numbers[SHIFT_STD])
 
 
-@nb.njit(cache=True)
+@nb.njit
 def apart(z, num, angle, skip):  # type: ignore[no-untyped-def]
     """Whether an angle keeps its distance from the active arms other than `skip`."""
     for a in range(num):
@@ -65,7 +65,7 @@ def apart(z, num, angle, skip):  # type: ignore[no-untyped-def]
     return True
 
 
-@nb.njit(cache=True)
+@nb.njit
 def log_head(z, numbers):  # type: ignore[no-untyped-def]
     """log density of the number of arms, the centre and the angles of all slots."""
     num = int(z[0])
@@ -78,7 +78,7 @@ def log_head(z, numbers):  # type: ignore[no-untyped-def]
     return value - square(z[1], numbers[CENTRE_STD]) - square(z[2], numbers[CENTRE_STD])
 
 
-@nb.njit(cache=True)
+@nb.njit
 def log_prior(z, numbers):  # type: ignore[no-untyped-def]
     """log p(z) of a packed state, inactive slots included (pseudo-priors)."""
     value = log_head(z, numbers)

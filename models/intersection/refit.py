@@ -17,7 +17,7 @@ import numba as nb
 import numpy as np
 
 from models.intersection import moments as mo
-from models.intersection.density import NO_LANE, lane_number
+from models.intersection.density import FAST, lane_number
 from models.intersection.moments import CHORD
 from models.intersection.moves import LEVER
 from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, SHIFT, WIDTH
@@ -31,6 +31,7 @@ from models.intersection.prior import (
     lanes_fit,
 )
 from models.intersection.wrap import wrap
+from models.overwrite import overwrite
 
 FREE = 5  # continuous numbers of an arm
 LOCAL = 2 + FREE  # those that the cost of a half on an arm depends on
@@ -68,7 +69,7 @@ def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
     arm, kind = index // EDITS_PER_ARM, index % EDITS_PER_ARM
     if arm >= int(z[0]):
         return False
-    z_new[:] = z
+    overwrite(z_new, z)
     o = HEAD + arm * ARM
     change = EDITS[kind]
     z_new[o + ENTRIES] += change[0]
@@ -87,38 +88,35 @@ def edit(index, z, floats, z_new):  # type: ignore[no-untyped-def]
     return lanes_fit(z_new[o + ENTRIES], z_new[o + EXITS], floats)
 
 
-@nb.njit(cache=True, error_model="numpy")
-def add_square(block, slopes, first, last, residual, weight):  # type: ignore[no-untyped-def]
-    """Add weight / 2 residual^2, sloping in unknowns first:last of an arm, to its block: hessian, gradient on top."""
-    for i in range(first, last):
-        pull = weight * slopes[i]
-        block[LOCAL, i] += residual * pull
-        for j in range(first, i + 1):
-            block[i, j] += pull * slopes[j]
+@nb.njit(error_model="numpy")
+def write_residuals(coef, h, cx, cy, dx, dy, arm, columns, n):  # type: ignore[no-untyped-def]
+    """Write the three residuals of one half track on its lane of an arm of direction (dx, dy) as columns n to n + 2.
 
-
-@nb.njit(cache=True, error_model="numpy")
-def add_half(coef, h, lane, z, arm, dx, dy, block, slopes):  # type: ignore[no-untyped-def]
-    """Add the cost of one half track on one lane of an arm with direction (dx, dy) to the arm's block.
-
-    block (LOCAL + 1, LOCAL) lower triangle over (c; angle, gap, width, bend, shift), then the gradient"""
-    o = HEAD + arm * ARM
-    bend, side = z[o + BEND], coef[mo.SIDE, h]
-    rx, ry = coef[mo.X, h] - z[1], coef[mo.Y, h] - z[2]
+    columns (LOCAL + 1, .): slopes in (c; angle, gap, width, bend, shift), then the residual itself, all times the
+    root of the weight"""
+    bend, side = arm[BEND], coef[mo.SIDE, h]
+    middle = lane_number(coef, h, cx, cy, dx, dy, arm) + 0.5
+    rx, ry = coef[mo.X, h] - cx, coef[mo.Y, h] - cy
     across, along = -dy * rx + dx * ry, dx * rx + dy * ry
-    slopes[0], slopes[1], slopes[2] = dy, -dx, -along
-    slopes[3], slopes[4], slopes[5], slopes[6] = -0.5 * side, -side * (lane + 0.5), -coef[mo.T, h], -1.0
-    target = z[o + SHIFT] + bend * coef[mo.T, h] + side * (0.5 * z[o + GAP] + (lane + 0.5) * z[o + WIDTH])
-    add_square(block, slopes, 0, LOCAL, across - target, coef[mo.W_ACROSS, h])
-    if coef[mo.W_ALONG, h] > 0.0:
-        slopes[0], slopes[1], slopes[2] = -dx, -dy, across
-        add_square(block, slopes, 0, 3, along - coef[mo.S, h], coef[mo.W_ALONG, h])
-    if coef[mo.W_HEADING, h] > 0.0:
-        lever = coef[mo.S, h] - 0.5 * CHORD
-        slopes[2], slopes[3], slopes[4], slopes[5] = -1.0, 0.0, 0.0, -lever
-        turn = wrap(coef[mo.OUTGOING, h] - z[o + ANGLE] - bend * lever)
-        add_square(block, slopes, 2, 6, turn, coef[mo.W_HEADING, h])
-    a, b = 2, 5  # scatter: angle and bend
+    target = arm[SHIFT] + bend * coef[mo.T, h] + side * (0.5 * arm[GAP] + middle * arm[WIDTH])
+    root = math.sqrt(coef[mo.W_ACROSS, h])
+    columns[0, n], columns[1, n], columns[2, n], columns[3, n] = root * dy, -root * dx, -root * along, -0.5 * root * side
+    columns[4, n], columns[5, n], columns[6, n] = -root * side * middle, -root * coef[mo.T, h], -root
+    columns[7, n] = root * (across - target)
+    for i in range(3, LOCAL):
+        columns[i, n + 1] = columns[i, n + 2] = 0.0
+    root = math.sqrt(coef[mo.W_ALONG, h])
+    columns[0, n + 1], columns[1, n + 1], columns[2, n + 1] = -root * dx, -root * dy, root * across
+    columns[7, n + 1] = root * (along - coef[mo.S, h])
+    root, lever = math.sqrt(coef[mo.W_HEADING, h]), coef[mo.S, h] - 0.5 * CHORD
+    columns[0, n + 2], columns[1, n + 2], columns[2, n + 2], columns[5, n + 2] = 0.0, 0.0, -root, -root * lever
+    columns[7, n + 2] = root * wrap(coef[mo.OUTGOING, h] - arm[ANGLE] - bend * lever)
+
+
+@nb.njit(error_model="numpy")
+def add_scatter(coef, h, bend, dx, dy, block):  # type: ignore[no-untyped-def]
+    """Add the scatter cost of one half to the block of its arm: in the angle and the bend."""
+    a, b = 2, 5
     twist = dx * coef[mo.A_KY, h] + dy * coef[mo.A_KX, h]
     block[LOCAL, a] += 2 * dx * dy * (coef[mo.A_YY, h] - coef[mo.A_XX, h]) + (dx * dx - dy * dy) * coef[mo.A_XY, h]
     block[LOCAL, a] += dx * coef[mo.A_Y, h] - dy * coef[mo.A_X, h] + bend * twist
@@ -130,20 +128,29 @@ def add_half(coef, h, lane, z, arm, dx, dy, block, slopes):  # type: ignore[no-u
     block[b, b] += 2 * coef[mo.A_KK, h]
 
 
-@nb.njit(cache=True, error_model="numpy")
-def assemble(blocks, hessian, gradient):  # type: ignore[no-untyped-def]
-    """The model of all unknowns, (c; five of every arm), from the blocks of the arms."""
-    hessian[:] = 0.0
-    gradient[:] = 0.0
-    for a in range(len(blocks)):
-        for i in range(LOCAL):
-            row = i if i < 2 else i + FREE * a
-            gradient[row] += blocks[a, LOCAL, i]
-            for j in range(i + 1):
-                hessian[row, j if j < 2 else j + FREE * a] += blocks[a, i, j]
+@nb.njit(fastmath=FAST, error_model="numpy")
+def square_columns(columns, n, block):  # type: ignore[no-untyped-def]
+    """block = J J^T of the first n columns, lower triangle: hessian of the arm's unknowns, then the gradient."""
+    for i in range(LOCAL + 1):
+        left = columns[i, :n]
+        for j in range(min(i + 1, LOCAL)):
+            right, total = columns[j, :n], 0.0
+            for k in range(n):
+                total += left[k] * right[k]
+            block[i, j] = total
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
+def add_block(block, arm, hessian, gradient):  # type: ignore[no-untyped-def]
+    """Add the block of an arm to the model of all unknowns, (c; five of every arm)."""
+    for i in range(LOCAL):
+        row = i if i < 2 else i + FREE * arm
+        gradient[row] += block[LOCAL, i]
+        for j in range(i + 1):
+            hessian[row, j if j < 2 else j + FREE * arm] += block[i, j]
+
+
+@nb.njit(error_model="numpy")
 def add_prior(z, floats, hessian, gradient):  # type: ignore[no-untyped-def]
     """Add the negative log prior of the continuous numbers; the row of a constant becomes that of the identity."""
     for j in range(2):
@@ -167,7 +174,7 @@ def add_prior(z, floats, hessian, gradient):  # type: ignore[no-untyped-def]
                 hold(hessian, gradient, first + j)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def hold(hessian, gradient, i):  # type: ignore[no-untyped-def]
     """Take an unknown out of the system: its step is zero."""
     hessian[i, :i] = 0.0
@@ -175,7 +182,7 @@ def hold(hessian, gradient, i):  # type: ignore[no-untyped-def]
     hessian[i, i], gradient[i] = 1.0, 0.0
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def solve_spd(matrix, vector, n):  # type: ignore[no-untyped-def]
     """Solve a symmetric positive definite system of size n in place by Cholesky; False where it is not."""
     for i in range(n):
@@ -200,28 +207,34 @@ def solve_spd(matrix, vector, n):  # type: ignore[no-untyped-def]
     return True
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def quadratic_model(z, coef, stray, rows, pick, floats, hessian, gradient):  # type: ignore[no-untyped-def]
     """Hessian (lower triangle) and gradient of -log p at z, halves on their closest lanes; stray halves say nothing."""
-    num = int(z[0])
-    blocks, slopes, directions = np.zeros((num, LOCAL + 1, LOCAL)), np.empty(LOCAL), np.empty((num, 2))
-    for a in range(num):
-        angle = z[HEAD + a * ARM + ANGLE]
-        directions[a, 0], directions[a, 1] = math.cos(angle), math.sin(angle)
-    for h in range(coef.shape[1]):
-        low, arm = NO_LANE, num
+    num, halves = int(z[0]), coef.shape[1]
+    columns, block, owner = np.empty((LOCAL + 1, 3 * halves)), np.empty((LOCAL + 1, LOCAL)), np.empty(halves, np.int64)
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    for h in range(halves):
+        low, owner[h] = stray[h], num
         for a in range(num):
             if rows[int(pick[a]), a, h] < low:
-                low, arm = rows[int(pick[a]), a, h], a
-        if low < NO_LANE and low < stray[h]:
-            lane = lane_number(coef, h, z[1], z[2], z[HEAD + arm * ARM : HEAD + (arm + 1) * ARM])
-            dx, dy = directions[arm, 0], directions[arm, 1]
-            add_half(coef, h, lane, z, arm, dx, dy, blocks[arm], slopes)
-    assemble(blocks, hessian, gradient)
+                low, owner[h] = rows[int(pick[a]), a, h], a
+    for a in range(num):
+        arm, n = z[HEAD + a * ARM : HEAD + (a + 1) * ARM], np.int64(0)  # of one type from the start: compiled once
+        dx, dy = math.cos(arm[ANGLE]), math.sin(arm[ANGLE])
+        for h in range(halves):
+            if owner[h] == a:
+                write_residuals(coef, h, z[1], z[2], dx, dy, arm, columns, n)
+                n += 3
+        square_columns(columns, n, block)
+        for h in range(halves):
+            if owner[h] == a:
+                add_scatter(coef, h, arm[BEND], dx, dy, block)
+        add_block(block, a, hessian, gradient)
     add_prior(z, floats, hessian, gradient)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(error_model="numpy")
 def take_step(z, step, gap_max):  # type: ignore[no-untyped-def]
     """z minus the Newton step, every number within its largest step."""
     for j in range(2):

@@ -17,7 +17,7 @@ NUM_CELLS = SIDE * SIDE
 NUM_SUMS = 8  # 1, x, y, xx, xy, yy, phi, phi phi
 
 
-@nb.njit(cache=True)
+@nb.njit
 def cell_of(cx, cy):  # type: ignore[no-untyped-def]
     """Grid cell of a centre; centres outside the grid use its border."""
     i = min(max(int(np.rint((cx + REACH) / CELL)), 0), SIDE - 1)
@@ -53,7 +53,7 @@ def prefix_sums(points, offsets):  # type: ignore[no-untyped-def]
     return sums
 
 
-@nb.njit(cache=True)
+@nb.njit
 def half_ranges(table, offsets, cell, margin, begin, end):  # type: ignore[no-untyped-def]
     """Points of the 2 T halves for a cell, `margin` points left out on either side of the split."""
     num = len(offsets) - 1
@@ -63,7 +63,7 @@ def half_ranges(table, offsets, cell, margin, begin, end):  # type: ignore[no-un
         begin[num + t], end[num + t] = min(offsets[t] + k + margin, offsets[t + 1]), offsets[t + 1]
 
 
-@nb.njit(cache=True)
+@nb.njit
 def cell_coefficients(sums, offsets, begin, end, position, heading, observed, fixed, out):  # type: ignore[no-untyped-def]
     """Coefficients (19, 2 T) of straight lanes for halves begin:end, from differences of the running sums."""
     num = len(offsets) - 1

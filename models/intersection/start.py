@@ -60,7 +60,7 @@ def group_directions(directions, angles):  # type: ignore[no-untyped-def]
     return num
 
 
-@nb.njit(cache=True)
+@nb.njit
 def lane_range(offsets, width, most):  # type: ignore[no-untyped-def]
     """Inner edge and number of lanes that hold sorted lateral offsets."""
     low, high = offsets[len(offsets) // 10], offsets[-1 - len(offsets) // 10]

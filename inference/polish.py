@@ -58,14 +58,15 @@ def _climb(edit, refit, evaluate, commit, num_edits, z, floats, ints, cache, sco
 
 @lru_cache(maxsize=1)
 def compiled_climb() -> Any:
-    """The greedy search for any kernel."""
+    """The greedy search for any kernel, called without looking at the types of its arguments."""
     import numba as nb
 
     types = kernel_types()
     functions = (types["function"](types[name]) for name in ("edit", "refit", "evaluate", "commit"))
     vector, index = types["vector"], types["index"]
     signature = nb.void(*functions, nb.int64, vector, vector, index, vector, vector)
-    return nb.njit(signature, cache=True, nogil=True)(_climb)
+    only: Any = next(iter(nb.njit(signature, cache=True, nogil=True)(_climb).overloads.values()))
+    return only.entry_point
 
 
 def polish(kernel: Kernel, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

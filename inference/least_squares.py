@@ -1,6 +1,6 @@
 """Nonlinear least squares with a Laplace posterior.
 
-In the whitened numbers x of a model (models.program.Bound) with residuals r(x) of its observations,
+In the whitened numbers x of a model (models.whitening.Bound) with residuals r(x) of its observations,
 
     cost(x) = |x|^2 / 2 + |r(x)|^2 / 2 = -log p(x, y) + const
     g = x + J^T r,   H = I + J^T J,   J = dr/dx                       Gauss-Newton
@@ -27,7 +27,8 @@ from torch import Tensor
 from torch.func import jacfwd, jacrev
 
 from inference.posterior import Posterior, Snapshots
-from models.program import Bound, InputError, Latents, Model, bind, log_joint, terms
+from models.program import InputError, Latents, Model, log_joint, terms
+from models.whitening import Bound, bind
 
 ROUNDING = float(np.finfo(np.float64).eps)
 MAX_DAMPING = 1e12  # past it a step is lost in rounding

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from inference import least_squares
-from models.program import InputError, bind, check, fix, observe, quiet_doubles, simulate
+from models.program import InputError, check, fix, observe, quiet_doubles, simulate
 from models.toys.gaussian import ConjugateGaussian, Readings
 from models.toys.slot_road import Markings, SlotRoad, offset
+from models.whitening import bind
 
 
 class Signal(NamedTuple):

@@ -16,19 +16,18 @@ from torch import Tensor
 
 from models.program import (
     InputError,
-    bind,
     check,
     fix,
     log_joint,
     observe,
     quiet_doubles,
-    residuals,
     simulate,
     terms,
     total,
 )
 from models.toys.gaussian import ConjugateGaussian, Readings
 from models.toys.slot_road import Markings, SlotRoad
+from models.whitening import bind, residuals
 
 COVARIANCE = torch.tensor([[2.0, 0.6], [0.6, 0.5]], dtype=torch.float64)
 

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ALLOWED = {
     "models": {"models"},
-    "inference": {"inference", "models.program", "models.whitening", "models.capability"},
+    "inference": {"inference", "models.program", "models.whitening", "models.capability", "models.overwrite"},
     "experiments": {"experiments", "inference", "models"},
     "benchmarks": {"benchmarks", "experiments", "inference", "models"},
 }

@@ -55,6 +55,7 @@ class JunctionEvidence(NamedTuple):
     points       (3, N) x, y about the origin [m] and heading [rad], half by half; None simulates
     s            (N,) distance from the origin along the lane [m]: a fixed covariate
     starts       (H + 1,) half h holds points starts[h]:starts[h + 1]
+    track        (H,) the track of each half, num_tracks of all tracks
     num_entries  of the halves; not `entries`, which is a site of the program
     origin       (2,) where the tracks meet [m]
     heading      whether headings were measured
@@ -64,6 +65,8 @@ class JunctionEvidence(NamedTuple):
     points: Tensor | None
     s: Array
     starts: NDArray[np.int64]
+    track: NDArray[np.int64]
+    num_tracks: int
     num_entries: int
     origin: Array
     heading: bool
@@ -127,7 +130,9 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
         )
     observed, s, starts = hv.gather_halves(points, path, phi, begin, end, entries, origin)
     whole = None if model.likelihood == "exact" else whole_tracks(points - origin, phi, offsets, path - origin)
-    return JunctionEvidence(torch.from_numpy(observed), s, starts, int(entries), origin, measured, whole)
+    track = np.searchsorted(offsets, begin, side="right") - 1
+    num = len(offsets) - 1
+    return JunctionEvidence(torch.from_numpy(observed), s, starts, track, num, int(entries), origin, measured, whole)
 
 
 def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Array:
@@ -136,7 +141,9 @@ def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Arra
     out = np.empty((NUM_COEFFICIENTS, observed.shape[1]))
     heading = noise.heading if evidence.heading else math.inf
     along = along_moments(evidence.s, evidence.starts)
-    coefficients(observed, along, evidence.num_entries, noise.position, noise.along, noise.offset, noise.phase, heading, out)
+    coefficients(
+        observed, along, evidence.num_entries, noise.position, noise.along, noise.offset, noise.phase, heading, out
+    )
     return out
 
 

@@ -12,6 +12,7 @@ from models.intersection.wrap import wrap
 SMOOTHING = 4  # points on either side
 END = 24  # points at a track's end that show an arm's direction
 TURN = 0.25  # change of direction that ends an arm [rad]
+LASTING = 5  # points that must have turned: smoothed noise lasts, too
 MARGIN = 4  # points left out before a turn
 ENOUGH = 30.0  # [m] of a half track
 CROSSES = 40.0  # [m] from the crossing: a track that stays farther away is none of its vehicles
@@ -112,18 +113,19 @@ def closest_index(path, first, last, x, y):  # type: ignore[no-untyped-def]
 def straight_end(turn, outer, inner, margin):  # type: ignore[no-untyped-def]
     """How far in from its outer end a half track keeps its direction: the first index that is left out.
 
-    Walks from index `outer` towards `inner` and stops where three headings in a row differ by more than TURN from
-    the mean of the outermost third, `margin` points before it."""
+    Walks from index `outer` towards `inner` and stops where LASTING headings in a row differ by more than TURN from
+    the mean of the outermost third, `margin` points before it; the third itself is straight by definition, or the
+    noise of short steps would take whole tracks away."""
     step = 1 if inner >= outer else -1
     third = max(abs(inner - outer) // 3, 3)
     mean = 0.0
     for j in range(third):
         mean += turn[outer + step * j] / third
     run = 0
-    for j in range(abs(inner - outer)):
+    for j in range(third, abs(inner - outer)):
         run = run + 1 if abs(wrap(turn[outer + step * j] - mean)) > TURN else 0
-        if run == 3:
-            return outer + step * max(j - 2 - margin, 0)
+        if run == LASTING:
+            return outer + step * max(j + 1 - LASTING - margin, 0)
     return inner
 
 

@@ -192,7 +192,7 @@ def evaluate_exact(z, floats, ints, cache, out):  # type: ignore[no-untyped-def]
     out[0], out[1] = remembered_prior(z, floats, cache), -math.inf
     if out[0] == -math.inf:
         return
-    z = window(z, 0, (SIZE,))  # type: ignore[call-arg]
+    z = window(z, 0, (SIZE,))
     halves, num = ints[NUM_HALVES], int(z[0])
     which, keys, turns, scatter, rows, _, room = memory(cache, halves)
     coef, stray = exact_data(floats, halves)
@@ -209,7 +209,7 @@ def evaluate_closest(z, floats, ints, cache, out):  # type: ignore[no-untyped-de
     out[0], out[1] = remembered_prior(z, floats, cache), -math.inf
     if out[0] == -math.inf:
         return
-    z = window(z, 0, (SIZE,))  # type: ignore[call-arg]
+    z = window(z, 0, (SIZE,))
     halves, entries, num = ints[NUM_HALVES], ints[NUM_ENTRIES], int(z[0])
     which, keys, turns, scatter, rows, counts, room = memory(cache, halves)
     if ints[LIKELIHOOD] == POINT:

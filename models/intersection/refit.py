@@ -100,7 +100,12 @@ def write_residuals(coef, h, cx, cy, dx, dy, arm, columns, n):  # type: ignore[n
     across, along = -dy * rx + dx * ry, dx * rx + dy * ry
     target = arm[SHIFT] + bend * coef[mo.T, h] + side * (0.5 * arm[GAP] + middle * arm[WIDTH])
     root = math.sqrt(coef[mo.W_ACROSS, h])
-    columns[0, n], columns[1, n], columns[2, n], columns[3, n] = root * dy, -root * dx, -root * along, -0.5 * root * side
+    columns[0, n], columns[1, n], columns[2, n], columns[3, n] = (
+        root * dy,
+        -root * dx,
+        -root * along,
+        -0.5 * root * side,
+    )
     columns[4, n], columns[5, n], columns[6, n] = -root * side * middle, -root * coef[mo.T, h], -root
     columns[7, n] = root * (across - target)
     for i in range(3, LOCAL):

@@ -9,8 +9,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 
-@intrinsic
-def window(context: Any, array: Any, begin: Any, shape: Any) -> Any:  # type: ignore[no-untyped-def]
+def _window(context: Any, array: Any, begin: Any, shape: Any) -> Any:
     """The C-ordered view of a vector that starts at `begin` and has `shape`, a tuple.
 
     It has no owner and nothing is checked, so it costs no atomic counting and no call. Valid only while the owner
@@ -25,7 +24,8 @@ def window(context: Any, array: Any, begin: Any, shape: Any) -> Any:  # type: ig
             target.cast(builder, builder.extract_value(arguments[2], i), axis, types.intp)
             for i, axis in enumerate(signature.args[2])
         ]
-        strides, items = [], ir.Constant(word, 1)
+        strides: list[Any] = []
+        items = ir.Constant(word, 1)
         for length in reversed(lengths):
             strides.insert(0, builder.mul(items, vector.itemsize))
             items = builder.mul(items, length)
@@ -37,6 +37,9 @@ def window(context: Any, array: Any, begin: Any, shape: Any) -> Any:  # type: ig
         return view._getvalue()
 
     return view_type(array, begin, shape), build
+
+
+window: Any = intrinsic(_window)
 
 
 def _packed(builder: Any, word: Any, values: list[Any]) -> Any:

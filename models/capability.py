@@ -3,6 +3,7 @@
     moves()            involutions for reversible jump
     start(evidence)    a data-driven first state, {site: (*event)}
     kernel(evidence)   a compiled density over a packed state
+    squares(evidence)  a compiled sum of squares of normal latents, for least squares without tracing the program
     dimension          name of the site that counts the active slots
 
 A move is an involution on (state, auxiliary numbers): (z, u) -> (z', u') and back, with u uniform
@@ -138,3 +139,39 @@ def pointer(function: Any) -> Any:
             return signature
 
     return Pointer()
+
+
+class Squares(NamedTuple):
+    """A program of normal latents whose observations are a sum of squares in machine code.
+
+        -log p(z, y) = |(z - loc) / scale|^2 / 2 + cost(z) + const,   z all latents one after the other
+
+    loc, scale  (D,) of the prior
+    sites       {site: part of z}, in the order of z
+    shapes      {site: shape of its event}
+    evaluate    (z, hessian (D, D), gradient (D,)) -> cost; fills the Gauss-Newton model of the cost at z
+    log_const   of the observations: log p(y | z) = log_const - cost(z)
+    """
+
+    loc: np.ndarray
+    scale: np.ndarray
+    sites: dict[str, slice]
+    shapes: dict[str, tuple[int, ...]]
+    evaluate: Callable[[np.ndarray, np.ndarray, np.ndarray], float]
+    log_const: float
+
+    def unpack(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """(*batch, D) to {site: (*batch, *event)}."""
+        return {n: z[..., part].reshape(z.shape[:-1] + self.shapes[n]) for n, part in self.sites.items()}
+
+    def pack(self, latents: dict[str, Any]) -> np.ndarray:
+        """{site: (*event)} to (D,)."""
+        return np.concatenate([np.asarray(latents[n], dtype=np.float64).reshape(-1) for n in self.sites])
+
+
+class HasSquares(Protocol):
+    """A program of normal latents that offers its observations as a compiled sum of squares."""
+
+    def __call__(self, evidence: Any) -> None: ...
+
+    def squares(self, evidence: Any) -> Squares: ...

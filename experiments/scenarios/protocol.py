@@ -18,6 +18,7 @@ import numpy as np
 from experiments.scenarios import paths
 from experiments.scenarios.occlusion import occlude
 from experiments.scenarios.scene import Floats, Ints, JunctionTruth, Scene, join_tracks
+from models.intersection.borders import interior_radius
 from models.intersection.tracks import Tracks
 from models.program import InputError
 
@@ -143,26 +144,6 @@ def _draw_angles(rng: np.random.Generator) -> Floats:
 def turns(angle: Floats) -> Floats:
     """Change of heading from entering by arm a to leaving by arm b, positive to the left, (K, K) [rad]."""
     return paths.wrap(angle[None, :] - angle[:, None] - np.pi)
-
-
-def interior_radius(angle: Floats, left: Floats, right: Floats) -> Floats:
-    """Where the interior begins on each arm, (K,) [m]: 2 m beyond the farthest point where its
-    border meets a neighbour's, within 8 to 32 m.
-
-    left, right  (K,) distance from the axis of the arm to its borders, looking outward [m]
-
-    With th the angle between an arm and the next one counter-clockwise, the left border of the one
-    meets the right border of the other at (right + left cos th) / sin th along the one and
-    (left + right cos th) / sin th along the other."""
-    order = np.argsort(angle % (2 * np.pi))
-    radius = np.full(len(angle), 8.0)
-    for a, b in zip(order, np.roll(order, -1), strict=True):
-        between = (angle[b] - angle[a]) % (2 * np.pi)
-        if 0.0 < between < np.pi - 0.05:  # borders of opposite arms do not meet
-            sin, cos = np.sin(between), np.cos(between)
-            radius[a] = max(radius[a], (right[b] + left[a] * cos) / sin)
-            radius[b] = max(radius[b], (left[a] + right[b] * cos) / sin)
-    return np.clip(radius + 2.0, 8.0, 32.0)
 
 
 def connect(angle: Floats, entries: Ints, exits: Ints) -> Ints:

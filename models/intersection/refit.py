@@ -17,7 +17,7 @@ import numba as nb
 import numpy as np
 
 from models.intersection import moments as mo
-from models.intersection.density import FAST, lane_number
+from models.intersection.density import lane_number
 from models.intersection.moments import CHORD
 from models.intersection.moves import LEVER
 from models.intersection.packing import ANGLE, ARM, BEND, ENTRIES, EXITS, GAP, HEAD, SHIFT, WIDTH
@@ -31,6 +31,7 @@ from models.intersection.prior import (
     lanes_fit,
 )
 from models.intersection.wrap import wrap
+from models.normal_equations import square_columns
 from models.overwrite import overwrite
 
 FREE = 5  # continuous numbers of an arm
@@ -131,18 +132,6 @@ def add_scatter(coef, h, bend, dx, dy, block):  # type: ignore[no-untyped-def]
     block[a, a] += max(curve, 0.0)
     block[b, a] += twist
     block[b, b] += 2 * coef[mo.A_KK, h]
-
-
-@nb.njit(fastmath=FAST, error_model="numpy")
-def square_columns(columns, n, block):  # type: ignore[no-untyped-def]
-    """block = J J^T of the first n columns, lower triangle: hessian of the arm's unknowns, then the gradient."""
-    for i in range(LOCAL + 1):
-        left = columns[i, :n]
-        for j in range(min(i + 1, LOCAL)):
-            right, total = columns[j, :n], 0.0
-            for k in range(n):
-                total += left[k] * right[k]
-            block[i, j] = total
 
 
 @nb.njit(error_model="numpy")

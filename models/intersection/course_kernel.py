@@ -1,0 +1,126 @@
+"""Lane courses as a sum of squares in machine code: every point against the nearest node of its lane.
+
+    lateral residual  (n . (p - x) - curvature along^2 / 2 + curvature position^2 / 2) / position
+    heading residual  wrap(phi - heading - curvature along) / sqrt(heading^2 + curvature^2 position^2)
+
+x is the nearest node, along the distance from it along the lane. The last term of the lateral residual is the bias
+of white noise in the plane: on the outside of a bend there is more room. Where along its lane a vehicle was says
+nothing. Points are summed node by node, so that the normal equations cost nodes, not points.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from models.intersection.course_nodes import LOCAL, course_nodes
+from models.intersection.wrap import wrap
+from models.normal_equations import square_columns
+
+NODE = 5 + LOCAL
+STRIDE = 4  # nodes between those that a track's first point is compared with
+
+
+@nb.njit(error_model="numpy")
+def nearest_node(nodes, num, x, y, j):  # type: ignore[no-untyped-def]
+    """The node where the distance to (x, y) stops falling, from node j on."""
+    least = (nodes[j, 0] - x) ** 2 + (nodes[j, 1] - y) ** 2
+    for step in (1, -1):
+        while 0 <= j + step < num:
+            other = (nodes[j + step, 0] - x) ** 2 + (nodes[j + step, 1] - y) ** 2
+            if other >= least:
+                break
+            j, least = j + step, other
+    return j
+
+
+@nb.njit(error_model="numpy")
+def sum_points(points, first, last, nodes, num, noise, sums):  # type: ignore[no-untyped-def]
+    """Add the residuals of one track to the sums of its lane's nodes; returns its cost.
+
+    noise (position, heading), heading inf where none is measured; sums (3, N): points, lateral, heading residuals"""
+    j, least = 0, np.inf
+    for k in range(0, num, STRIDE):
+        far = (nodes[k, 0] - points[0, first]) ** 2 + (nodes[k, 1] - points[1, first]) ** 2
+        if far < least:
+            j, least = k, far
+    variance, cost = noise[0] ** 2, 0.0
+    for i in range(first, last):
+        j = nearest_node(nodes, num, points[0, i], points[1, i], j)
+        ux, uy, curvature = nodes[j, 2], nodes[j, 3], nodes[j, 4]
+        dx, dy = points[0, i] - nodes[j, 0], points[1, i] - nodes[j, 1]
+        along = ux * dx + uy * dy
+        lateral = -uy * dx + ux * dy - 0.5 * curvature * along**2 + 0.5 * curvature * variance
+        sums[0, j] += 1.0
+        sums[1, j] += lateral
+        cost += 0.5 * lateral**2 / variance
+        if noise[1] < np.inf:
+            spread = noise[1] ** 2 + curvature**2 * variance
+            turn = wrap(points[2, i] - math.atan2(uy, ux) - curvature * along)
+            sums[2, j] += turn
+            cost += 0.5 * turn**2 / spread + 0.5 * math.log(spread / noise[1] ** 2)
+    return cost
+
+
+@nb.njit(error_model="numpy")
+def residual_columns(nodes, num, noise, sums, columns):  # type: ignore[no-untyped-def]
+    """The mean residuals of all nodes, times the root of their weights, as columns (LOCAL + 1, .); returns how many."""
+    n = 0
+    for j in range(num):
+        if sums[0, j] > 0.0:
+            root = math.sqrt(sums[0, j]) / noise[0]
+            for p in range(LOCAL):
+                columns[p, n] = -root * nodes[j, 5 + p]
+            columns[LOCAL, n] = root * sums[1, j] / sums[0, j]
+            n += 1
+    if noise[1] == np.inf:
+        return n
+    for j in range(1, num - 1):
+        if sums[0, j] > 0.0:
+            root = math.sqrt(sums[0, j] / (noise[1] ** 2 + (nodes[j, 4] * noise[0]) ** 2))
+            apart = math.hypot(nodes[j + 1, 0] - nodes[j - 1, 0], nodes[j + 1, 1] - nodes[j - 1, 1])
+            for p in range(LOCAL):
+                columns[p, n] = -root * (nodes[j + 1, 5 + p] - nodes[j - 1, 5 + p]) / apart
+            columns[LOCAL, n] = root * sums[2, j] / sums[0, j]
+            n += 1
+    return n
+
+
+@nb.njit(cache=True, error_model="numpy")
+def normal_equations(z, where, lanes, reach, counts, tracks, starts, offsets, points, noise, hessian, gradient):  # type: ignore[no-untyped-def]
+    """Cost of all points, its gradient (D,) and Gauss-Newton Hessian (D, D) in z (D,).
+
+    where   (L, LOCAL) which of z each lane depends on; lanes, reach, counts as in `course_nodes`, for every lane
+    tracks  of lane l: tracks[starts[l]:starts[l + 1]]; track t holds points (3, N) offsets[t]:offsets[t + 1]"""
+    most = 0
+    for lane in range(len(where)):
+        most = max(most, counts[lane, 0] + counts[lane, 1] + 1 + counts[lane, 2])
+    nodes, sums, columns = np.empty((most, NODE)), np.empty((3, most)), np.empty((LOCAL + 1, 2 * most))
+    block, v, cost = np.empty((LOCAL + 1, LOCAL)), np.empty(LOCAL), 0.0
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    for lane in range(len(where)):
+        index = where[lane]
+        for p in range(LOCAL):
+            v[p] = z[index[p]]
+        num = course_nodes(v, lanes[lane], reach[lane], counts[lane], nodes)
+        sums[:] = 0.0
+        for k in range(starts[lane], starts[lane + 1]):
+            t = tracks[k]
+            cost += sum_points(points, offsets[t], offsets[t + 1], nodes, num, noise, sums)
+        square_columns(columns, residual_columns(nodes, num, noise, sums, columns), block)
+        for p in range(LOCAL):
+            gradient[index[p]] += block[LOCAL, p]
+            for q in range(p + 1):
+                hessian[index[p], index[q]] += block[p, q]
+                if p != q:
+                    hessian[index[q], index[p]] += block[p, q]
+    return cost
+
+
+@nb.njit(cache=True, error_model="numpy")
+def centre_line(v, lanes, reach, counts, nodes):  # type: ignore[no-untyped-def]
+    """`course_nodes` for callers in Python."""
+    return course_nodes(v, lanes, reach, counts, nodes)

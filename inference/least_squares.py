@@ -26,7 +26,9 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd, jacrev
 
+from inference import squares
 from inference.posterior import Posterior, Snapshots
+from models.capability import HasSquares
 from models.program import InputError, Latents, Model, log_joint, terms
 from models.whitening import Bound, bind
 
@@ -109,21 +111,32 @@ def run(
     damping: float = 1e-3,
     tolerance: float = 1e-10,
     continuation: Sequence[float] = (1.0,),
+    learn: Sequence[str] = (),
     num_draws: int = 1000,
 ) -> Posterior:
     """Minimise, then draw from the Laplace posterior: one chain of independent draws.
+
+    A model with squares() is minimised in machine code (inference.squares), any other through its program.
 
     init          {site: (*event)} natural latents; None takes model.start(evidence) where the model
                   has it, else the prior median x = 0
     num_steps     at most, for each inflation
     damping       first damping, relative to diag H
     tolerance     stop where an undamped step promises a smaller decrease of the cost [nats]
-    continuation  falling inflations of the observation noise, the last one 1
+    continuation  falling inflations of the observation noise, the last one 1; of programs only
+    learn         sites whose prior scale is learnt from the data (empirical Bayes); of models with squares() only
 
     Raises InputError by name for observations that are not Gaussian or whose scale depends on
-    latents, and for an init outside the prior's support."""
+    latents, for an init outside the prior's support, and for knobs that this model's way has not."""
     begin = time.perf_counter()
     _check_continuation(continuation)
+    if isinstance(model, HasSquares):
+        if len(continuation) > 1:
+            raise InputError("continuation is not for models with squares(); leave it at [1.0]")
+        knobs: dict[str, Any] = {"num_steps": num_steps, "damping": damping, "tolerance": tolerance}
+        return squares.run(model, evidence, seed=seed, init=init, learn=tuple(learn), num_draws=num_draws, **knobs)
+    if learn:
+        raise InputError(f"learn needs a model with squares(), but {type(model).__name__} has none; leave it empty")
     bound = bind(model, evidence)
     bound.check_residuals()
     path = [(0, 0.0, _first(bound, init))]

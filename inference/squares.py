@@ -13,13 +13,15 @@ configured scale s_0): for the numbers of one site, with posterior variances v_i
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import time
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from models.capability import Squares
+from inference.posterior import Posterior, Snapshots
+from models.capability import HasSquares, Squares
 from models.program import InputError
 
 Array = NDArray[np.float64]
@@ -38,11 +40,11 @@ class State(NamedTuple):
 
 
 class Path(NamedTuple):
-    """What a minimisation did: the last state, prior scales (D,), costs by step, whether nothing is left to gain."""
+    """What a minimisation did: the last state, prior scales (D,), latents by step, whether nothing is left to gain."""
 
     state: State
     scale: Array
-    costs: list[float]
+    visited: list[tuple[float, float, Array]]  # seconds, cost, z (D,)
     converged: bool
 
 
@@ -64,9 +66,9 @@ def minimise(
     unknown = [name for name in learn if name not in squares.sites]
     if unknown:
         raise InputError(f"learn names {', '.join(unknown)}, but the latents are {', '.join(squares.sites)}")
-    scale, growth = squares.scale, 2.0
+    began, scale, growth, converged = time.perf_counter(), squares.scale, 2.0, False
     state = linearise(squares, scale, x)
-    costs, converged = [state.cost], False
+    visited = [(time.perf_counter() - began, state.cost, squares.loc + scale * x)]
     for number in range(num_steps):
         hessian = state.hessian.copy()
         hessian[np.diag_indices(len(x))] *= 1.0 + damping
@@ -82,10 +84,10 @@ def minimise(
             state, growth = new, 2.0
         else:
             damping, growth = damping * growth, 2.0 * growth
-        costs.append(state.cost)
         if learn and number >= FIRST_LEARNT:
             state, scale = relearn(squares, state, scale, learn)
-    return Path(state, scale, costs, converged)
+        visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
+    return Path(state, scale, visited, converged)
 
 
 def relearn(squares: Squares, state: State, scale: Array, learn: tuple[str, ...]) -> tuple[State, Array]:
@@ -106,3 +108,48 @@ def relearn(squares: Squares, state: State, scale: Array, learn: tuple[str, ...]
     hessian = factor[:, None] * hessian * factor + np.eye(len(x))
     cost = state.cost - 0.5 * float(state.x @ state.x) + 0.5 * float(x @ x)
     return State(x, cost, x + factor * flat, hessian), new
+
+
+def run(
+    model: HasSquares,
+    evidence: Any,
+    *,
+    seed: int,
+    init: dict[str, Any] | None,
+    num_steps: int,
+    damping: float,
+    tolerance: float,
+    learn: tuple[str, ...],
+    num_draws: int,
+) -> Posterior:
+    """Minimise, then draw from the Laplace posterior, as inference.least_squares.run does and says."""
+    began = time.perf_counter()
+    squares = model.squares(evidence)
+    x = np.zeros(len(squares.loc)) if init is None else (squares.pack(init) - squares.loc) / squares.scale
+    path = minimise(squares, x, num_steps=num_steps, damping=damping, tolerance=tolerance, learn=learn)
+    factor = np.linalg.cholesky(path.state.hessian)
+    noise = np.random.default_rng(np.random.SeedSequence(seed)).standard_normal((len(x), num_draws))
+    numbers = path.state.x[:, None] + solve_triangular(factor, noise, trans="T", lower=True)
+    times, costs, states = zip(*path.visited, strict=True)
+    scales = {name: float(path.scale[part][0]) for name, part in squares.sites.items() if name in learn}
+    left = f"not converged after {num_steps} steps; raise num_steps or start closer (init)"
+    return Posterior(
+        draws={n: v[None] for n, v in squares.unpack(squares.loc + path.scale * numbers.T).items()},
+        log_evidence=squares.log_const - path.state.cost - float(np.log(factor.diagonal()).sum()),
+        estimate=squares.unpack(states[-1]),
+        info={
+            "evaluations": len(states),
+            "seconds": time.perf_counter() - began,
+            "cost": path.state.cost,
+            "steps": len(states) - 1,
+            "converged": path.converged,
+            "learnt_scales": scales,
+            "flags": [] if path.converged else [left],
+        },
+        snapshots=Snapshots(
+            np.arange(len(states)),
+            np.array(times),
+            squares.log_const - np.array(costs) - 0.5 * len(x) * np.log(2 * np.pi) - np.log(path.scale).sum(),
+            squares.unpack(np.stack(states)),
+        ),
+    )

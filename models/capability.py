@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from torch import Tensor
@@ -169,6 +169,7 @@ class Squares(NamedTuple):
         return np.concatenate([np.asarray(latents[n], dtype=np.float64).reshape(-1) for n in self.sites])
 
 
+@runtime_checkable
 class HasSquares(Protocol):
     """A program of normal latents that offers its observations as a compiled sum of squares."""
 

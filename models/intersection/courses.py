@@ -170,9 +170,9 @@ def _evaluate(
     full = base.copy()
     full[index] = z
     if len(index) == len(base):
-        return float(normal_equations(full, where, *data, hessian, gradient))
+        return float(normal_equations(full, where, *data, hessian, gradient))  # type: ignore[call-arg]
     all_hessian, all_gradient = np.empty((len(base), len(base))), np.empty(len(base))
-    cost = normal_equations(full, where, *data, all_hessian, all_gradient)
+    cost = normal_equations(full, where, *data, all_hessian, all_gradient)  # type: ignore[call-arg]
     hessian[:], gradient[:] = all_hessian[np.ix_(index, index)], all_gradient[index]
     return float(cost)
 
@@ -201,7 +201,8 @@ class PointsOnCourses(TorchDistribution):
         size = self.layout.size
         hessian, gradient = np.empty((size, size)), np.empty(size)
         rows = self.numbers.detach().reshape(-1, size).numpy()
-        costs = [normal_equations(z, self.layout.where, *data, hessian, gradient) for z in rows]
+        rest = (self.layout.where, *data, hessian, gradient)
+        costs = [normal_equations(z, *rest) for z in rows]  # type: ignore[call-arg]
         return constant - torch.tensor(costs, dtype=torch.float64).reshape(self.batch_shape)
 
 
@@ -282,3 +283,25 @@ def lane_nodes(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[Arr
         centre_line(z[layout.where[lane]], lanes[lane], evidence.reach[lane], counts, nodes)
         out.append(nodes)
     return out
+
+
+def lane_bands(
+    evidence: CourseEvidence, estimate: Mapping[str, Any], draws: Mapping[str, Array], level: float
+) -> tuple[list[Array], list[Array]]:
+    """How far left and right of the estimate's centre lines the draws' lines lie, L arrays (n,) each [m].
+
+    draws  {site: (D, *event)}, equally weighted; displacements are linear in what separates a draw from the
+    estimate. Between the two edges lies the share `level` of the draws at each point, half of the rest on either
+    side."""
+    layout = Layout(evidence)
+    here = layout.pack({name: estimate.get(name, evidence.loc[name]) for name in SITES})
+    num = len(next(iter(draws.values())))
+    there = [draws.get(n, np.broadcast_to(evidence.loc[n], (num, *evidence.loc[n].shape))) for n in SITES]
+    apart = np.concatenate([values.reshape(num, -1) for values in there], 1) - here
+    left, right = [], []
+    for nodes, index in zip(lane_nodes(evidence, estimate), layout.where, strict=True):
+        across = nodes[:, 5:] @ apart[:, index].T  # (n, D)
+        low, high = np.quantile(across, [0.5 - level / 2, 0.5 + level / 2], axis=1)
+        left.append(high)
+        right.append(-low)
+    return left, right

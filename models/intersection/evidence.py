@@ -59,7 +59,8 @@ class JunctionEvidence(NamedTuple):
     num_entries  of the halves; not `entries`, which is a site of the program
     origin       (2,) where the tracks meet [m]
     heading      whether headings were measured
-    whole        the tracks as given, about the origin: [M20]'s likelihoods split them at the latent centre
+    tracks       as given; None where half tracks were simulated
+    whole        the same about the origin: [M20]'s likelihoods split them at the latent centre
     """
 
     points: Tensor | None
@@ -70,6 +71,7 @@ class JunctionEvidence(NamedTuple):
     num_entries: int
     origin: Array
     heading: bool
+    tracks: Tracks | None
     whole: WholeTracks | None
 
     @property
@@ -132,7 +134,8 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
     whole = None if model.likelihood == "exact" else whole_tracks(points - origin, phi, offsets, path - origin)
     track = np.searchsorted(offsets, begin, side="right") - 1
     num = len(offsets) - 1
-    return JunctionEvidence(torch.from_numpy(observed), s, starts, track, num, int(entries), origin, measured, whole)
+    halves = (torch.from_numpy(observed), s, starts, track, num, int(entries))
+    return JunctionEvidence(*halves, origin, measured, Tracks(points, heading, offsets), whole)
 
 
 def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Array:

@@ -1,0 +1,113 @@
+"""Structure, then lanes: an engine made of two.
+
+The structure engine finds arms and lane counts; every track is put on the entry and the exit lane it most probably
+drove; the refining engine then estimates the courses of all lanes together.
+
+    waybayes experiment=lanes                      a simulated junction, lane by lane
+    waybayes experiment=lanes scenario.seed=3 engine.courses.heading_std=0.2
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from inference.posterior import Posterior
+from models.intersection.courses import CourseEvidence, LaneCourses, centre_lines, lane_bands
+from models.intersection.evidence import JunctionEvidence
+from models.intersection.routes import RoutedTracks, Routes, find_routes
+from models.intersection.state import Junction
+from models.program import InputError
+
+Engine = Callable[..., Posterior]
+Array = NDArray[np.float64]
+BAND = 0.9  # posterior probability between the edges of a band
+
+
+class Lanes(NamedTuple):
+    """The centre lines of L lanes.
+
+    lines   L arrays (n, 2) in driving order [m]
+    left    L arrays (n,): the centre line lies at most this far to the left of `lines` ...
+    right   ... and this far to the right, with 90 % posterior probability at each point [m]
+    routes  their entries and exits, and which track drove which lane
+    """
+
+    lines: list[Array]
+    left: list[Array]
+    right: list[Array]
+    routes: Routes
+
+
+@dataclass(frozen=True)
+class LanePosterior(Posterior):
+    """The posterior of the structure, with the lanes on its best state.
+
+    lanes    centre lines with bands
+    first    the same lanes where their refinement began
+    courses  posterior of the refinement
+    """
+
+    lanes: Lanes | None = None
+    first: list[Array] | None = None
+    courses: Posterior | None = None
+
+    def save(self, folder: Path) -> None:
+        """posterior.npz and .json as ever, the lanes in lanes.npz, one array per lane: x, y, left, right."""
+        super().save(folder)
+        assert self.lanes is not None
+        arrays = {
+            f"lane_{i}": np.column_stack([line, self.lanes.left[i], self.lanes.right[i]])
+            for i, line in enumerate(self.lanes.lines)
+        }
+        routes = self.lanes.routes._asdict()
+        np.savez_compressed(folder / "lanes.npz", allow_pickle=False, **arrays, **routes)
+
+
+def estimate(
+    model: Junction,
+    evidence: JunctionEvidence,
+    *,
+    seed: int,
+    structure: Engine,
+    refine: Engine,
+    courses: LaneCourses,
+) -> LanePosterior:
+    """Run both engines. Raises InputError where a model is none of an intersection with the exact likelihood."""
+    if not isinstance(model, Junction) or model.likelihood != "exact":
+        raise InputError(
+            "engine lanes needs model=junction or junction_real with likelihood exact; it reads their routes"
+        )
+    seeds = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2)]
+    found = structure(model, evidence, seed=seeds[0])
+    began = time.perf_counter()
+    posterior, course_evidence, routes = refine_lanes(model, evidence, found, refine, courses, seeds[1])
+    lines = centre_lines(course_evidence, posterior.estimate)
+    left, right = lane_bands(course_evidence, posterior.estimate, posterior.resample(500, seeds[1]), BAND)
+    flags = [*found.info.get("flags", []), *posterior.info.get("flags", [])]
+    info = found.info | {"lanes": len(lines), "lane_seconds": time.perf_counter() - began, "flags": flags}
+    fields = {name: getattr(found, name) for name in found.__dataclass_fields__}
+    return LanePosterior(
+        **fields | {"info": info},
+        lanes=Lanes(lines, left, right, routes),
+        first=centre_lines(course_evidence, {}),
+        courses=posterior,
+    )
+
+
+def refine_lanes(
+    model: Junction, evidence: JunctionEvidence, found: Posterior, refine: Engine, courses: LaneCourses, seed: int
+) -> tuple[Posterior, CourseEvidence, Routes]:
+    """From the structure to the courses: their posterior, what it was learnt from, the routes."""
+    if evidence.tracks is None:
+        raise InputError("lanes need whole tracks, but this evidence was simulated half by half")
+    routes = find_routes(model, evidence, found.estimate)
+    structure = found.estimate | {n: np.full(len(found.estimate["angle"]), v) for n, v in model.constants.items()}
+    course_evidence = courses.prepare(RoutedTracks(evidence.tracks, structure, routes))
+    return refine(courses, course_evidence, seed=seed), course_evidence, routes

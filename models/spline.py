@@ -25,7 +25,7 @@ ORDER = 4  # controls that count on a piece
 @nb.njit(error_model="numpy")
 def spline_weights(x, first, spacing, num, weights, slopes):  # type: ignore[no-untyped-def]
     """N (4,) and dN/dx (4,) of the controls that count at x, of `num`; returns the first of these controls."""
-    piece = min(max(int(math.floor((x - first) / spacing)), 0), num - ORDER)
+    piece = min(max(int(math.floor((x - first) / spacing)), 0), num - ORDER)  # noqa: RUF046
     u = (x - first) / spacing - piece
     w = 1.0 - u
     weights[0], weights[3] = w * w * w / 6.0, u * u * u / 6.0
@@ -34,6 +34,15 @@ def spline_weights(x, first, spacing, num, weights, slopes):  # type: ignore[no-
     slopes[0], slopes[3] = -0.5 * w * w / spacing, 0.5 * u * u / spacing
     slopes[1], slopes[2] = (1.5 * u - 2.0) * u / spacing, (2.0 - 1.5 * w) * w / spacing
     return piece
+
+
+@nb.njit(error_model="numpy")
+def spline_bows(x, first, spacing, num, bows):  # type: ignore[no-untyped-def]
+    """d2N/dx2 (4,) of the controls that count at x."""
+    u = (x - first) / spacing - min(max(int(math.floor((x - first) / spacing)), 0), num - ORDER)  # noqa: RUF046
+    bows[0], bows[1], bows[2], bows[3] = 1.0 - u, 3.0 * u - 2.0, 1.0 - 3.0 * u, u
+    for k in range(ORDER):
+        bows[k] /= spacing**2
 
 
 @nb.njit(cache=True, error_model="numpy")

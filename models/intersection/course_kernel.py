@@ -15,11 +15,10 @@ import math
 import numba as nb
 import numpy as np
 
-from models.intersection.course_nodes import LOCAL, course_nodes
+from models.intersection.course_nodes import course_nodes
 from models.intersection.wrap import wrap
 from models.normal_equations import square_columns
 
-NODE = 5 + LOCAL
 STRIDE = 4  # nodes between those that a track's first point is compared with
 
 
@@ -66,14 +65,14 @@ def sum_points(points, first, last, nodes, num, noise, sums):  # type: ignore[no
 
 @nb.njit(error_model="numpy")
 def residual_columns(nodes, num, noise, sums, columns):  # type: ignore[no-untyped-def]
-    """The mean residuals of all nodes, times the root of their weights, as columns (LOCAL + 1, .); returns how many."""
-    n = 0
+    """The mean residuals of all nodes, times the root of their weights, as columns (D + 1, .); returns how many."""
+    n, size = 0, len(columns) - 1
     for j in range(num):
         if sums[0, j] > 0.0:
             root = math.sqrt(sums[0, j]) / noise[0]
-            for p in range(LOCAL):
+            for p in range(size):
                 columns[p, n] = -root * nodes[j, 5 + p]
-            columns[LOCAL, n] = root * sums[1, j] / sums[0, j]
+            columns[size, n] = root * sums[1, j] / sums[0, j]
             n += 1
     if noise[1] == np.inf:
         return n
@@ -81,9 +80,9 @@ def residual_columns(nodes, num, noise, sums, columns):  # type: ignore[no-untyp
         if sums[0, j] > 0.0:
             root = math.sqrt(sums[0, j] / (noise[1] ** 2 + (nodes[j, 4] * noise[0]) ** 2))
             apart = math.hypot(nodes[j + 1, 0] - nodes[j - 1, 0], nodes[j + 1, 1] - nodes[j - 1, 1])
-            for p in range(LOCAL):
+            for p in range(size):
                 columns[p, n] = -root * (nodes[j + 1, 5 + p] - nodes[j - 1, 5 + p]) / apart
-            columns[LOCAL, n] = root * sums[2, j] / sums[0, j]
+            columns[size, n] = root * sums[2, j] / sums[0, j]
             n += 1
     return n
 
@@ -92,18 +91,19 @@ def residual_columns(nodes, num, noise, sums, columns):  # type: ignore[no-untyp
 def normal_equations(z, where, lanes, reach, counts, tracks, starts, offsets, points, noise, hessian, gradient):  # type: ignore[no-untyped-def]
     """Cost of all points, its gradient (D,) and Gauss-Newton Hessian (D, D) in z (D,).
 
-    where   (L, LOCAL) which of z each lane depends on; lanes, reach, counts as in `course_nodes`, for every lane
+    where   (L, D') which of z each lane depends on; lanes, reach, counts as in `course_nodes`, for every lane
     tracks  of lane l: tracks[starts[l]:starts[l + 1]]; track t holds points (3, N) offsets[t]:offsets[t + 1]"""
     most = 0
     for lane in range(len(where)):
         most = max(most, counts[lane, 0] + counts[lane, 1] + 1 + counts[lane, 2])
-    nodes, sums, columns = np.empty((most, NODE)), np.empty((3, most)), np.empty((LOCAL + 1, 2 * most))
-    block, v, cost = np.empty((LOCAL + 1, LOCAL)), np.empty(LOCAL), 0.0
+    size, cost = where.shape[1], 0.0
+    nodes, sums, columns = np.empty((most, 5 + size)), np.empty((3, most)), np.empty((size + 1, 2 * most))
+    block, v = np.empty((size + 1, size)), np.empty(size)
     hessian[:] = 0.0
     gradient[:] = 0.0
     for lane in range(len(where)):
         index = where[lane]
-        for p in range(LOCAL):
+        for p in range(size):
             v[p] = z[index[p]]
         num = course_nodes(v, lanes[lane], reach[lane], counts[lane], nodes)
         sums[:] = 0.0
@@ -111,8 +111,8 @@ def normal_equations(z, where, lanes, reach, counts, tracks, starts, offsets, po
             t = tracks[k]
             cost += sum_points(points, offsets[t], offsets[t + 1], nodes, num, noise, sums)
         square_columns(columns, residual_columns(nodes, num, noise, sums, columns), block)
-        for p in range(LOCAL):
-            gradient[index[p]] += block[LOCAL, p]
+        for p in range(size):
+            gradient[index[p]] += block[size, p]
             for q in range(p + 1):
                 hessian[index[p], index[q]] += block[p, q]
                 if p != q:

@@ -12,6 +12,10 @@ arc, stretched:
     h_e = handle_e |P_1 - P_0| / (3 cos^2(theta / 4)),   theta the change of heading
 
 which is (2/3) tan(theta/4) / sin(theta/2) written without its removable pole.
+
+Real lanes are no such curves. Waves, cubic B-splines across them, make up for it where they are latent: one of each
+arm and one of each lane of an arm, in t, and one of each interior, in the parameter of its Bezier curve, which
+vanishes with two derivatives where the interior ends.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import numpy as np
 
 from models.intersection.moments import CHORD
 from models.intersection.wrap import wrap
+from models.spline import ORDER, spline_bows, spline_weights
 
 # what one end of a lane depends on
 ANGLE, GAP, WIDTH, BEND, SHIFT, ONSET, OFFSET, ADVANCE, HANDLE = range(9)
@@ -33,23 +38,31 @@ LEAST_ONSET = 2.0  # [m]
 LEAST_HANDLE, LARGEST_HANDLE = 0.2, 2.0
 SHARPEST = 2.9  # [rad] of turn: sharper ones keep these handles
 
+WAVE_BEGIN, WAVE_PIECE, WAVE_PIECES = 8.0, 8.0, 7  # [m] from the centre; straight on before and beyond
+ARM_WAVE = WAVE_PIECES + 3  # controls
+INNER_WAVE = 6  # controls, those of INNER_WAVE + 3 pieces that vanish at both ends
+WAVES = 4 * ARM_WAVE + INNER_WAVE  # after the LOCAL numbers: arm and lane of the entry, of the exit, then the interior
+
 
 @nb.njit(error_model="numpy")
 def arm_point(v, end, lane, t, point, tangent, slopes):  # type: ignore[no-untyped-def]
     """Point at distance t out on an arm and its outward tangent d + bend (t - CHORD / 2) n, with their derivatives.
 
-    v       (LOCAL,) numbers of the lane
-    slopes  (LOCAL + 1, 4) of (point, tangent); the last row is the derivative in t"""
+    v       (LOCAL,) numbers of the lane, or (LOCAL + WAVES,) with waves
+    slopes  (len(v) + 1, 4) of (point, tangent); the last row is the derivative in t"""
     o, side = HEAD + END * end, 1.0 - 2.0 * end
     dx, dy = math.cos(v[o + ANGLE]), math.sin(v[o + ANGLE])
     nx, ny = -dy, dx
     arch, lean = 0.5 * t * (t - CHORD), t - 0.5 * CHORD
     rank = side * (lane + 0.5)
     across = v[o + SHIFT] + v[o + OFFSET] + 0.5 * side * v[o + GAP] + rank * (v[2] + v[o + WIDTH]) + v[o + BEND] * arch
-    slope = v[o + BEND] * lean
+    slope, curve = v[o + BEND] * lean, v[o + BEND]
+    slopes[:] = 0.0
+    if len(v) > LOCAL:
+        first = LOCAL + 2 * ARM_WAVE * end
+        across, slope, curve = add_waves(v, first, t, nx, ny, slopes, across, slope, curve)
     point[0], point[1] = v[0] + t * dx + across * nx, v[1] + t * dy + across * ny
     tangent[0], tangent[1] = dx + slope * nx, dy + slope * ny
-    slopes[:] = 0.0
     slopes[0, 0] = slopes[1, 1] = 1.0
     slopes[2, 0], slopes[2, 1] = rank * nx, rank * ny
     slopes[o + ANGLE, 0], slopes[o + ANGLE, 1] = t * nx - across * dx, t * ny - across * dy
@@ -57,8 +70,24 @@ def arm_point(v, end, lane, t, point, tangent, slopes):  # type: ignore[no-untyp
     for field, push in ((GAP, 0.5 * side), (WIDTH, rank), (SHIFT, 1.0), (OFFSET, 1.0), (BEND, arch)):
         slopes[o + field, 0], slopes[o + field, 1] = push * nx, push * ny
     slopes[o + BEND, 2], slopes[o + BEND, 3] = lean * nx, lean * ny
-    slopes[LOCAL, 0], slopes[LOCAL, 1] = tangent[0], tangent[1]
-    slopes[LOCAL, 2], slopes[LOCAL, 3] = v[o + BEND] * nx, v[o + BEND] * ny
+    slopes[len(v), 0], slopes[len(v), 1] = tangent[0], tangent[1]
+    slopes[len(v), 2], slopes[len(v), 3] = curve * nx, curve * ny
+    return curve
+
+
+@nb.njit(error_model="numpy")
+def add_waves(v, first, t, nx, ny, slopes, across, slope, curve):  # type: ignore[no-untyped-def]
+    """Add the waves of an arm and of its lane, controls from `first` on, to the offset and its two derivatives in t."""
+    weights, last = np.empty((3, ORDER)), WAVE_BEGIN + WAVE_PIECE * WAVE_PIECES
+    place, inside = min(max(t, WAVE_BEGIN), last), 1.0 if WAVE_BEGIN < t < last else 0.0
+    piece = spline_weights(place, WAVE_BEGIN, WAVE_PIECE, ARM_WAVE, weights[0], weights[1])
+    spline_bows(place, WAVE_BEGIN, WAVE_PIECE, ARM_WAVE, weights[2])
+    for k in range(ORDER):
+        value, lean, bow = weights[0, k], inside * weights[1, k], inside * weights[2, k]
+        for i in (first + piece + k, first + ARM_WAVE + piece + k):
+            across, slope, curve = across + value * v[i], slope + lean * v[i], curve + bow * v[i]
+            slopes[i, 0], slopes[i, 1], slopes[i, 2], slopes[i, 3] = value * nx, value * ny, lean * nx, lean * ny
+    return across, slope, curve
 
 
 @nb.njit(error_model="numpy")
@@ -83,32 +112,32 @@ def interior_end(v, end, lane, point, tangent, slopes):  # type: ignore[no-untyp
     arm_point(v, end, lane, r, point, tangent, slopes)
     for field in (ONSET, ADVANCE):
         for j in range(4):
-            slopes[HEAD + END * end + field, j] = free * slopes[LOCAL, j]
+            slopes[HEAD + END * end + field, j] = free * slopes[len(v), j]
 
 
 @nb.njit(error_model="numpy")
 def arm_nodes(v, end, lane, reach, num, nodes, first):  # type: ignore[no-untyped-def]
     """`num` nodes from `reach` down to the interior of the entry arm, or outwards on the exit arm, from row `first`."""
     r, _ = start_of_interior(v, end)
-    point, tangent, slopes = np.empty(2), np.empty(2), np.empty((LOCAL + 1, 4))
+    point, tangent, slopes = np.empty(2), np.empty(2), np.empty((len(v) + 1, 4))
     forward = 2.0 * end - 1.0  # outward tangents point against the traffic of an entry
     for i in range(num):
         share = (num - i) / num if end == 0 else (i + 1) / num
-        arm_point(v, end, lane, r + share * (reach - r), point, tangent, slopes)
+        curve = arm_point(v, end, lane, r + share * (reach - r), point, tangent, slopes)
         length = math.hypot(tangent[0], tangent[1])
         ux, uy = forward * tangent[0] / length, forward * tangent[1] / length
         node = nodes[first + i]
         node[0], node[1], node[2], node[3] = point[0], point[1], ux, uy
-        node[4] = forward * v[HEAD + END * end + BEND] / length**3
-        for p in range(LOCAL):
+        node[4] = forward * curve / length**3
+        for p in range(len(v)):
             node[5 + p] = -uy * slopes[p, 0] + ux * slopes[p, 1]
 
 
 @nb.njit(error_model="numpy")
 def interior_nodes(v, lanes, num, nodes, first):  # type: ignore[no-untyped-def]
     """`num` + 1 nodes of the Bezier curve, its ends included, from row `first`."""
-    p0, t0, s0 = np.empty(2), np.empty(2), np.empty((LOCAL + 1, 4))
-    p3, t3, s3 = np.empty(2), np.empty(2), np.empty((LOCAL + 1, 4))
+    p0, t0, s0 = np.empty(2), np.empty(2), np.empty((len(v) + 1, 4))
+    p3, t3, s3 = np.empty(2), np.empty(2), np.empty((len(v) + 1, 4))
     interior_end(v, 0, lanes[0], p0, t0, s0)
     interior_end(v, 1, lanes[1], p3, t3, s3)
     ex, ey = p3[0] - p0[0], p3[1] - p0[1]
@@ -120,9 +149,9 @@ def interior_nodes(v, lanes, num, nodes, first):  # type: ignore[no-untyped-def]
     arc_slope = 0.5 * arc * math.tan(0.25 * bounded) if abs(turn) < SHARPEST else 0.0
     (k0, free0), (k3, free3) = stretch(v, 0), stretch(v, 1)
     h0, h3 = k0 * distance * arc, k3 * distance * arc
-    q1, q2 = np.empty((LOCAL, 2)), np.empty((LOCAL, 2))  # derivatives of the two inner control points
+    q1, q2 = np.empty((len(v), 2)), np.empty((len(v), 2))  # derivatives of the two inner control points
     long0, long3 = t0[0] ** 2 + t0[1] ** 2, t3[0] ** 2 + t3[1] ** 2
-    for p in range(LOCAL):
+    for p in range(len(v)):
         nearer = ex * (s3[p, 0] - s0[p, 0]) + ey * (s3[p, 1] - s0[p, 1])
         bending = (t3[0] * s3[p, 3] - t3[1] * s3[p, 2]) / long3 - (t0[0] * s0[p, 3] - t0[1] * s0[p, 2]) / long0
         longer = nearer * arc + distance * arc_slope * bending
@@ -147,21 +176,43 @@ def interior_nodes(v, lanes, num, nodes, first):  # type: ignore[no-untyped-def]
         length = math.hypot(gx, gy) + 1e-9
         ux, uy = gx / length, gy / length
         node[2], node[3], node[4] = ux, uy, (gx * ay - gy * ax) / length**3
-        for p in range(LOCAL):
+        for p in range(len(v)):
             x = b0 * s0[p, 0] + b1 * q1[p, 0] + b2 * q2[p, 0] + b3 * s3[p, 0]
             y = b0 * s0[p, 1] + b1 * q1[p, 1] + b2 * q2[p, 1] + b3 * s3[p, 1]
             node[5 + p] = -uy * x + ux * y
+        if len(v) > LOCAL:
+            ripple(v, u, length, node)
+
+
+@nb.njit(error_model="numpy")
+def ripple(v, u, speed, node):  # type: ignore[no-untyped-def]
+    """Add the wave of the interior at parameter u, where the Bezier curve has this speed, to its node."""
+    first, weights, num = LOCAL + 4 * ARM_WAVE, np.empty((3, ORDER)), INNER_WAVE + 6
+    piece = spline_weights(u, 0.0, 1.0 / (num - 3), num, weights[0], weights[1])
+    spline_bows(u, 0.0, 1.0 / (num - 3), num, weights[2])
+    across = slope = curve = 0.0
+    for k in range(ORDER):
+        i = piece + k - 3
+        if 0 <= i < INNER_WAVE:
+            across += weights[0, k] * v[first + i]
+            slope += weights[1, k] * v[first + i] / speed
+            curve += weights[2, k] * v[first + i] / speed**2
+            node[5 + first + i] = weights[0, k]
+    ux, uy, length = node[2], node[3], math.hypot(1.0, slope)
+    node[0], node[1] = node[0] - across * uy, node[1] + across * ux
+    node[2], node[3] = (ux - slope * uy) / length, (uy + slope * ux) / length
+    node[4] += curve / length**3
 
 
 @nb.njit(error_model="numpy")
 def course_nodes(v, lanes, reach, counts, nodes):  # type: ignore[no-untyped-def]
     """All nodes of a lane in driving order; returns how many.
 
-    v       (LOCAL,) numbers of the lane
+    v       (LOCAL,) numbers of the lane, or (LOCAL + WAVES,) with waves
     lanes   (2,) number of its entry lane and of its exit lane on their arms
     reach   (2,) distance from the centre to which it is known on either arm
     counts  (3,) nodes on the entry arm, pieces of the interior, nodes on the exit arm
-    nodes   (N, 5 + LOCAL): x, y, unit tangent, curvature, displacement to the left per unit of every number"""
+    nodes   (N, 5 + len(v)): x, y, unit tangent, curvature, displacement to the left per unit of every number"""
     arm_nodes(v, 0, lanes[0], reach[0], counts[0], nodes, 0)
     interior_nodes(v, lanes, counts[1], nodes, counts[0])
     arm_nodes(v, 1, lanes[1], reach[1], counts[2], nodes, counts[0] + counts[1] + 1)

@@ -9,6 +9,8 @@ estimated together from all points, with normal priors about what the structure 
     offset   (S,) of a lane of an arm across it [m], S lanes that were driven
     advance  (L, 2) of a lane's own onset before the arm's, at its entry and its exit [m]
     handle   (L, 2) lengths of its Bezier handles over those of a circular arc
+    arm_wave (K, .), lane_wave (S, .), inner_wave (L, .)   control points across an arm, a lane of an arm and an
+             interior [m]: what real lanes do besides
 
 See models.intersection.course_nodes for the curve and models.intersection.course_kernel for the residuals. [M20]
 fits one B-spline to every lane and ties neighbours on an arm together by their distance; here they share their arm.
@@ -33,15 +35,16 @@ from torch.distributions import constraints
 
 from models.capability import Squares
 from models.intersection.borders import BEYOND, FARTHEST, interior_radius
-from models.intersection.course_kernel import NODE, centre_line, normal_equations
-from models.intersection.course_nodes import END, LOCAL
+from models.intersection.course_kernel import centre_line, normal_equations
+from models.intersection.course_nodes import ARM_WAVE, END, INNER_WAVE, LOCAL, WAVES
 from models.intersection.routes import RoutedTracks
 from models.program import InputError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 ARM_SITES = ("angle", "gap", "width", "bend", "shift", "onset")
-SITES = ("centre", "lane_width", *ARM_SITES, "offset", "advance", "handle")
+PLAIN = ("centre", "lane_width", *ARM_SITES, "offset", "advance", "handle")
+SITES = (*PLAIN, "arm_wave", "lane_wave", "inner_wave")
 
 
 class CourseEvidence(NamedTuple):
@@ -87,6 +90,9 @@ class LaneCourses:
     offset_std: float = 0.0  # [m]
     advance_std: float = 0.5  # [m]
     handle_std: float = 0.15
+    arm_wave_std: float = 0.0  # [m]
+    lane_wave_std: float = 0.0  # [m]
+    inner_wave_std: float = 0.0  # [m]
     position_std: float = 1.0  # of a point, on each axis [m]
     heading_std: float = 0.1  # of a measured heading [rad]
     spacing: float = 1.0  # of the nodes [m]
@@ -97,6 +103,11 @@ class LaneCourses:
             loc, std = torch.from_numpy(evidence.loc[name]), getattr(self, f"{name}_std")
             latents[name] = pyro.sample(name, dist.Normal(loc, std).to_event(loc.dim())) if std > 0 else loc
         pyro.sample("points", PointsOnCourses(self, evidence, latents), obs=evidence.points)
+
+    @property
+    def waves(self) -> bool:
+        """Whether any wave is latent."""
+        return max(self.arm_wave_std, self.lane_wave_std, self.inner_wave_std) > 0.0
 
     def prepare(self, routed: RoutedTracks) -> CourseEvidence:
         """Evidence of this model. Raises InputError where no track is on a route."""
@@ -113,24 +124,27 @@ class LaneCourses:
         scale = [np.full(part.stop - part.start, getattr(self, f"{name}_std")) for name, part in sites.items()]
         loc = np.concatenate([evidence.loc[name].reshape(-1) for name in sites])
         held = {name: value for name, value in evidence.loc.items() if name not in sites}
-        whole = Layout(evidence)
+        whole = Layout(evidence, self.waves)
         index = np.concatenate([np.arange(whole.sites[name].start, whole.sites[name].stop) for name in sites])
-        base = whole.pack({name: held.get(name, evidence.loc[name]) for name in SITES})
+        base = whole.pack(held | evidence.loc)
         data = evidence_arrays(self, evidence)
         evaluate = partial(_evaluate, base, index, whole.where, data)
         return Squares(loc, np.concatenate(scale), sites, shapes, evaluate, log_constant(self, evidence))
 
 
 class Layout:
-    """All sites in one vector of numbers, constants included, and the part of it that each lane depends on."""
+    """All sites in one vector of numbers, constants included, and the part of it that each lane depends on.
 
-    def __init__(self, evidence: CourseEvidence) -> None:
-        sizes = [evidence.loc[name].size for name in SITES]
+    Without waves these are left out: lanes are then quicker to compute."""
+
+    def __init__(self, evidence: CourseEvidence, waves: bool) -> None:
+        names = SITES if waves else PLAIN
+        sizes = [evidence.loc[name].size for name in names]
         ends = np.cumsum([0, *sizes])
         self.size = int(ends[-1])
-        self.sites = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(SITES)}
+        self.sites = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(names)}
         num = len(evidence.connections)
-        self.where = np.zeros((num, LOCAL), np.int64)
+        self.where = np.zeros((num, LOCAL + (WAVES if waves else 0)), np.int64)
         self.where[:, 1] = 1
         for end in range(2):
             first, arm = 3 + END * end, evidence.connections[:, 2 * end]
@@ -140,9 +154,20 @@ class Layout:
             own = [self.sites["offset"].start + evidence.stubs[:, end]]
             own += [self.sites[name].start + 2 * np.arange(num) + end for name in ("advance", "handle")]
             self.where[:, first + len(ARM_SITES) : first + END] = np.stack(own, 1)
+            if waves:
+                first = LOCAL + 2 * ARM_WAVE * end
+                self.where[:, first : first + ARM_WAVE] = self._rows("arm_wave", arm, ARM_WAVE)
+                first += ARM_WAVE
+                self.where[:, first : first + ARM_WAVE] = self._rows("lane_wave", evidence.stubs[:, end], ARM_WAVE)
+        if waves:
+            self.where[:, LOCAL + 4 * ARM_WAVE :] = self._rows("inner_wave", np.arange(num), INNER_WAVE)
+
+    def _rows(self, name: str, rows: Ints, width: int) -> Ints:
+        return np.asarray(self.sites[name].start + width * rows[:, None] + np.arange(width))
 
     def pack(self, latents: Mapping[str, Any]) -> Array:
-        return np.concatenate([np.asarray(latents[name], dtype=np.float64).reshape(-1) for name in SITES])
+        """{site: (*event)} to (D,)."""
+        return np.concatenate([np.asarray(latents[name], dtype=np.float64).reshape(-1) for name in self.sites])
 
 
 def evidence_arrays(model: LaneCourses, evidence: CourseEvidence) -> tuple[Any, ...]:
@@ -187,8 +212,9 @@ class PointsOnCourses(TorchDistribution):
     support = constraints.independent(constraints.real, 2)
 
     def __init__(self, model: LaneCourses, evidence: CourseEvidence, latents: dict[str, Tensor]) -> None:
-        self.model, self.evidence, self.layout = model, evidence, Layout(evidence)
-        events = {name: evidence.loc[name].ndim for name in SITES}
+        self.model, self.evidence, self.layout = model, evidence, Layout(evidence, model.waves)
+        events = {name: evidence.loc[name].ndim for name in self.layout.sites}
+        latents = {name: latents[name] for name in events}
         batch = torch.broadcast_shapes(*(v.shape[: v.dim() - events[n]] for n, v in latents.items()))
         flat = [v.expand(batch + v.shape[v.dim() - events[n] :]).reshape((*batch, -1)) for n, v in latents.items()]
         self.numbers = torch.cat(flat, -1)
@@ -242,6 +268,8 @@ def prior_middles(structure: Mapping[str, Any], connections: Ints, num_stubs: in
     loc["onset"] = interior_radius(loc["angle"], left, right)
     loc["offset"], loc["advance"] = np.zeros(num_stubs), np.zeros((len(connections), 2))
     loc["handle"] = np.ones((len(connections), 2))
+    loc["arm_wave"], loc["lane_wave"] = np.zeros((num, ARM_WAVE)), np.zeros((num_stubs, ARM_WAVE))
+    loc["inner_wave"] = np.zeros((len(connections), INNER_WAVE))
     return loc
 
 
@@ -273,13 +301,18 @@ def centre_lines(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[A
     return [nodes[:, :2] + evidence.origin for nodes in lane_nodes(evidence, latents)]
 
 
+def layout_of(evidence: CourseEvidence, latents: Mapping[str, Any]) -> Layout:
+    """The layout of a state: with waves where it has any."""
+    return Layout(evidence, any(name in latents for name in SITES if name not in PLAIN))
+
+
 def lane_nodes(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[Array]:
     """Nodes of all lanes, see `course_nodes`."""
-    layout = Layout(evidence)
-    z = layout.pack({name: latents.get(name, evidence.loc[name]) for name in SITES})
+    layout = layout_of(evidence, latents)
+    z = layout.pack(evidence.loc | dict(latents))
     lanes, out = np.ascontiguousarray(evidence.connections[:, 1::2]), []
     for lane, counts in enumerate(evidence.counts):
-        nodes = np.empty((counts.sum() + 1, NODE))
+        nodes = np.empty((counts.sum() + 1, 5 + layout.where.shape[1]))
         centre_line(z[layout.where[lane]], lanes[lane], evidence.reach[lane], counts, nodes)
         out.append(nodes)
     return out
@@ -293,10 +326,10 @@ def lane_bands(
     draws  {site: (D, *event)}, equally weighted; displacements are linear in what separates a draw from the
     estimate. Between the two edges lies the share `level` of the draws at each point, half of the rest on either
     side."""
-    layout = Layout(evidence)
-    here = layout.pack({name: estimate.get(name, evidence.loc[name]) for name in SITES})
+    layout = layout_of(evidence, estimate)
+    here = layout.pack(evidence.loc | dict(estimate))
     num = len(next(iter(draws.values())))
-    there = [draws.get(n, np.broadcast_to(evidence.loc[n], (num, *evidence.loc[n].shape))) for n in SITES]
+    there = [draws.get(n, np.broadcast_to(evidence.loc[n], (num, *evidence.loc[n].shape))) for n in layout.sites]
     apart = np.concatenate([values.reshape(num, -1) for values in there], 1) - here
     left, right = [], []
     for nodes, index in zip(lane_nodes(evidence, estimate), layout.where, strict=True):

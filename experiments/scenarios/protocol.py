@@ -5,17 +5,18 @@
 
 The papers do not publish their junctions. Ours: 3 to 6 arms of 60 m at least 25 degrees apart, gap
 U(0, 4) m, 1 to 4 entries and exits of 2.7 m, turns up to 130 degrees, interiors that are cubic
-Bezier curves. Seeds 0 to 999 are the frozen 1000 scenes; geometry, vehicles and noise have their
-own streams, so that an option changes nothing but itself.
+Bezier curves (or others, see `interiors`). Seeds 0 to 999 are the frozen 1000 scenes; geometry,
+vehicles, noise and other interiors have their own streams, so that an option changes nothing but itself.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Literal, get_args
 
 import numpy as np
 
-from experiments.scenarios import paths
+from experiments.scenarios import interiors, paths
 from experiments.scenarios.occlusion import occlude
 from experiments.scenarios.scene import Floats, Ints, JunctionTruth, Scene, join_tracks
 from models.intersection.borders import interior_radius
@@ -36,6 +37,7 @@ def protocol(
     occlusion: bool = False,
     tracks: int | None = None,
     max_lanes: int = 4,
+    interior: Literal["bezier", "clothoid", "bumps"] = "bezier",
 ) -> Scene:
     """A simulated junction of the protocol.
 
@@ -45,15 +47,19 @@ def protocol(
     occlusion     see the junction from one standing vehicle (`occlusion.occlude`)
     tracks        vehicles on each lane, None draws 3 to 5
     max_lanes     entries and exits of an arm are uniform on 1 to max_lanes
+    interior      family of the courses between the arms, see `interiors`
 
-    Raises InputError for a negative seed and for max_lanes or tracks below one.
+    Raises InputError for a negative seed, for max_lanes or tracks below one and for an unknown interior.
     """
     if seed < 0:
         raise InputError(f"scenario protocol: seed is {seed}; choose 0 to 999 for the frozen scenes")
     if max_lanes < 1:
         raise InputError(f"scenario protocol: max_lanes is {max_lanes}, but every arm has lanes; choose 1 or more")
-    geometry, vehicles, view = np.random.SeedSequence(seed).spawn(3)
-    truth = random_junction(np.random.default_rng(geometry), max_lanes)
+    if interior not in get_args(interiors.Kind):
+        known = ", ".join(get_args(interiors.Kind))
+        raise InputError(f"scenario protocol: interior is '{interior}'; choose one of {known}")
+    geometry, vehicles, view, own = np.random.SeedSequence(seed).spawn(4)
+    truth = random_junction(np.random.default_rng(geometry), max_lanes, interior, np.random.default_rng(own))
     data, track_lane = drive(truth.lines, vehicles, position_std, heading_std, tracks)
     if occlusion:
         data, track_lane = occlude(data, track_lane, truth, np.random.default_rng(view))
@@ -64,6 +70,7 @@ def protocol(
         "position_std": position_std,
         "heading_std": heading_std,
         "occlusion": occlusion,
+        "interior": interior,
         **counts(truth, data),
     }
     return Scene(data, truth, f"protocol {seed}", info)
@@ -115,8 +122,12 @@ def drive(
 # A random junction
 
 
-def random_junction(rng: np.random.Generator, max_lanes: int) -> JunctionTruth:
-    """Draw arms, lanes, the connections between them and their centre lines; no vehicle yet."""
+def random_junction(
+    rng: np.random.Generator, max_lanes: int, interior: interiors.Kind, own: np.random.Generator
+) -> JunctionTruth:
+    """Draw arms, lanes, the connections between them and their centre lines; no vehicle yet.
+
+    own  stream of what interiors other than Bezier curves draw"""
     angle = _draw_angles(rng)
     arms = len(angle)
     entries, exits = rng.integers(1, max_lanes + 1, (2, arms))
@@ -127,7 +138,9 @@ def random_junction(rng: np.random.Generator, max_lanes: int) -> JunctionTruth:
     truth = JunctionTruth(
         centre, angle, gap, entries, exits, width, radius, [], connections, np.zeros(0, dtype=np.int64)
     )
-    return truth._replace(lines=[_course(truth, connection, rng) for connection in connections])
+    courses = interiors.draw(interior, [_ends(truth, connection) for connection in connections], rng, own)
+    lines = [_line(truth, connection, course) for connection, course in zip(connections, courses, strict=True)]
+    return truth._replace(lines=lines)
 
 
 def _draw_angles(rng: np.random.Generator) -> Floats:
@@ -177,22 +190,23 @@ def connect(angle: Floats, entries: Ints, exits: Ints) -> Ints:
     return np.array(sorted(connections), dtype=np.int64)
 
 
-def _course(truth: JunctionTruth, connection: Ints, rng: np.random.Generator) -> Floats:
-    """Centre line of one connection: straight on the arms, a cubic Bezier curve inside.
-
-    Its handles are those of a circular arc through both ends, h = |P3 - P0| (2/3) tan(th/4) / sin(th/2)
-    for a turn of th, each stretched by U(0.85, 1.15)."""
+def _ends(truth: JunctionTruth, connection: Ints) -> interiors.Ends:
+    """Where the interior of one connection meets its arms."""
     a, entry, b, exit = connection
-    start, p0 = (_stub(truth, a, entry, +1, r) for r in (ARM_LENGTH, truth.radius[a]))
-    p3, end = (_stub(truth, b, exit, -1, r) for r in (truth.radius[b], ARM_LENGTH))
-    turn = max(abs(turns(truth.angle)[a, b]), 1e-3)  # the limit of a straight crossing is 1/3
-    handle = np.linalg.norm(p3 - p0) * (2 / 3) * np.tan(turn / 4) / np.sin(turn / 2)
-    stretch = rng.uniform(0.85, 1.15, 2)
-    p1 = p0 - handle * stretch[0] * _outward(truth.angle[a])
-    p2 = p3 - handle * stretch[1] * _outward(truth.angle[b])
-    u = np.linspace(0.0, 1.0, 401)[:, None]
-    inside = (1 - u) ** 3 * p0 + 3 * u * (1 - u) ** 2 * p1 + 3 * u**2 * (1 - u) * p2 + u**3 * p3
-    return paths.resample(np.concatenate([start[None], inside, end[None]]), LINE_STEP)
+    return interiors.Ends(
+        start=_stub(truth, a, entry, +1, truth.radius[a]),
+        end=_stub(truth, b, exit, -1, truth.radius[b]),
+        ahead=-_outward(truth.angle[a]),
+        away=_outward(truth.angle[b]),
+        turn=float(turns(truth.angle)[a, b]),
+    )
+
+
+def _line(truth: JunctionTruth, connection: Ints, course: Floats) -> Floats:
+    """Centre line of one connection: straight on the arms, its course between them."""
+    a, entry, b, exit = connection
+    start, end = _stub(truth, a, entry, +1, ARM_LENGTH), _stub(truth, b, exit, -1, ARM_LENGTH)
+    return paths.resample(np.concatenate([start[None], course, end[None]]), LINE_STEP)
 
 
 def _outward(angle: float) -> Floats:

@@ -20,15 +20,16 @@ from models.intersection.tracks import Tracks
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 SHORT = 8  # points at the end of a track that has no half there
-CLOSE = 2.0  # [m] from the middle of a lane that such an end is on, at most ...
-ALONG = 0.6  # ... and off its direction [rad]
+CLOSE = 4.0  # [m] from the middle of a lane that such an end is on, at most ...
+ALONG = 0.9  # ... and off its direction [rad]
 RELUCTANCE = 60.0  # nats: a half that turns early still tells its lane, though it scatters like a stray one
 
 
 class Routes(NamedTuple):
     """What tracks drove.
 
-    connections  (L, 4) entry arm, entry lane, exit arm, exit lane; lanes from the middle of the arm outwards
+    connections  (L, 4) entry arm, entry lane, exit arm, exit lane; lanes from the middle of the arm outwards;
+                 -1 is a lane inside the innermost one, E or O one outside the outermost
     track_route  (T,) row of `connections` of every track, -1 for one that has no entry or no exit
     """
 
@@ -81,7 +82,7 @@ def find_routes(model: Junction, evidence: JunctionEvidence, estimate: Mapping[s
     for side, first in ((entry, 0), (~entry, 2)):
         ends[evidence.track[side], first], ends[evidence.track[side], first + 1] = arm[side], lane[side]
     complete_ends(model, evidence, estimate, ends)
-    whole = (ends >= 0).all(1)
+    whole = (ends[:, ::2] >= 0).all(1)
     connections, route = np.unique(ends[whole], axis=0, return_inverse=True)
     track_route = np.full(len(ends), -1)
     track_route[whole] = route.reshape(-1)
@@ -117,9 +118,10 @@ def complete_ends(
 
 
 def _arm_lanes(model: Junction, estimate: Mapping[str, NDArray[Any]], side: Literal[1, -1]) -> tuple[Ints, Array]:
-    """(arm, lane) of all lanes of a side and their centre lines outwards, a point each metre, (lanes, n, 2)."""
+    """(arm, lane) of all lanes of a side, one more on either edge included, and their centre lines outwards, a point
+    each metre, (lanes, n, 2): a pocket for turning may lie beside what half tracks show."""
     counts = np.asarray(estimate["entries" if side == 1 else "exits"])[: int(estimate["num_arms"])]
-    names = np.array([(arm, lane) for arm, count in enumerate(counts) for lane in range(int(count))])
+    names = np.array([(arm, lane) for arm, count in enumerate(counts) for lane in range(-1, int(count) + 1)])
     s = np.arange(0.0, 80.0)
     return names, np.stack([lane_points(estimate, arm, lane, side, s, model.width) for arm, lane in names])
 

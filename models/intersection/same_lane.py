@@ -1,0 +1,64 @@
+"""Routes that are one lane: tracks that were put on neighbouring lanes of an arm, but drove the same one.
+
+Both routes' tracks are laid along the first one's course; where no stretch of WINDOW metres finds them farther apart
+than SAME metres on average, they are one. Neighbouring lanes are about 3 m apart somewhere; of one lane, only the
+noise of the tracks and how its drivers keep off its middle lie between."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from models.intersection.course_kernel import sum_points
+from models.intersection.courses import CourseEvidence, lane_nodes
+from models.intersection.routes import Routes
+
+Ints = NDArray[np.int64]
+WINDOW = 24.0  # [m] of a stretch
+SAME = 1.35  # [m]
+
+
+@nb.njit(cache=True, error_model="numpy")
+def lateral_sums(points, offsets, tracks, nodes):  # type: ignore[no-untyped-def]
+    """Points and summed lateral distances at every node of a course, (3, n), of some tracks."""
+    sums, noise = np.zeros((3, len(nodes))), np.array([1.0, np.inf])
+    for t in tracks:
+        sum_points(points, offsets[t], offsets[t + 1], nodes, len(nodes), noise, sums)
+    return sums
+
+
+def stretch_distance(one: NDArray[np.float64], other: NDArray[np.float64], nodes: int) -> float:
+    """Largest mean distance over stretches of `nodes` nodes that both have points in; inf where there is none."""
+    running = [np.concatenate([np.zeros((2, 1)), np.cumsum(sums[:2], axis=1)], 1) for sums in (one, other)]
+    span = min(nodes, one.shape[1])
+    (n1, y1), (n2, y2) = (r[:, span:] - r[:, :-span] for r in running)
+    both = np.minimum(n1, n2) >= 0.5 * span
+    if not both.any():
+        return float("inf")
+    return float(np.abs(y1[both] / n1[both] - y2[both] / n2[both]).max())
+
+
+def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float) -> Routes:
+    """The same routes, those that are one lane in one; the lane with more tracks gives its name."""
+    connections, points = routes.connections, np.ascontiguousarray(evidence.points.numpy())
+    size = np.bincount(routes.track_route[routes.track_route >= 0], minlength=len(connections))
+    near = np.abs(connections[:, None, 1::2] - connections[None, :, 1::2]).max(-1) <= 1
+    near &= (connections[:, None, ::2] == connections[None, :, ::2]).all(-1)
+    if near.sum() == len(connections):  # every lane by itself
+        return routes
+    becomes, courses = np.arange(len(connections)), lane_nodes(evidence, {})
+    of_lane = [evidence.tracks[a:b] for a, b in zip(evidence.starts[:-1], evidence.starts[1:], strict=True)]
+    for i in np.argsort(-size, kind="stable"):
+        own = None
+        for j in np.flatnonzero(near[i] & (becomes == np.arange(len(becomes)))):
+            if j == i or becomes[i] != i or size[j] > size[i]:
+                continue
+            own = lateral_sums(points, evidence.offsets, of_lane[i], courses[i]) if own is None else own
+            theirs = lateral_sums(points, evidence.offsets, of_lane[j], courses[i])
+            if stretch_distance(own, theirs, round(WINDOW / spacing)) < SAME:
+                becomes[j] = i
+    kept = np.flatnonzero(becomes == np.arange(len(becomes)))
+    number = np.searchsorted(kept, becomes)
+    on_route = routes.track_route >= 0
+    return Routes(connections[kept], np.where(on_route, number[routes.track_route], -1))

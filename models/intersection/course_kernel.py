@@ -20,6 +20,7 @@ from models.intersection.wrap import wrap
 from models.normal_equations import square_columns
 
 STRIDE = 4  # nodes between those that a track's first point is compared with
+LOST = 5.0  # [m] from the node that a point was followed to: it is sought anew, for distances rise before a sharp bend
 
 
 @nb.njit(error_model="numpy")
@@ -36,18 +37,28 @@ def nearest_node(nodes, num, x, y, j):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
+def rough_node(nodes, num, x, y):  # type: ignore[no-untyped-def]
+    """The nearest one of every STRIDE-th node."""
+    j, least = 0, np.inf
+    for k in range(0, num, STRIDE):
+        far = (nodes[k, 0] - x) ** 2 + (nodes[k, 1] - y) ** 2
+        if far < least:
+            j, least = k, far
+    return j
+
+
+@nb.njit(error_model="numpy")
 def sum_points(points, first, last, nodes, num, noise, sums):  # type: ignore[no-untyped-def]
     """Add the residuals of one track to the sums of its lane's nodes; returns its cost.
 
     noise (position, heading), heading inf where none is measured; sums (3, N): points, lateral, heading residuals"""
-    j, least = 0, np.inf
-    for k in range(0, num, STRIDE):
-        far = (nodes[k, 0] - points[0, first]) ** 2 + (nodes[k, 1] - points[1, first]) ** 2
-        if far < least:
-            j, least = k, far
+    j = rough_node(nodes, num, points[0, first], points[1, first])
     variance, cost = noise[0] ** 2, 0.0
     for i in range(first, last):
         j = nearest_node(nodes, num, points[0, i], points[1, i], j)
+        if (nodes[j, 0] - points[0, i]) ** 2 + (nodes[j, 1] - points[1, i]) ** 2 > LOST**2:
+            j = rough_node(nodes, num, points[0, i], points[1, i])
+            j = nearest_node(nodes, num, points[0, i], points[1, i], j)
         ux, uy, curvature = nodes[j, 2], nodes[j, 3], nodes[j, 4]
         dx, dy = points[0, i] - nodes[j, 0], points[1, i] - nodes[j, 1]
         along = ux * dx + uy * dy

@@ -83,9 +83,8 @@ def test_what_one_bend_cannot_join_stays_a_bezier_curve() -> None:
     gentle, behind = ends_of(0.9 * GENTLEST, 12.0, 12.0), ends_of(math.radians(60.0), 12.0, -1.0)
     sharp = ends_of(math.radians(60.0), 12.0, 12.0)
     assert [fits(e) for e in (gentle, behind, sharp)] == [False, False, True]
-    rngs = [[np.random.default_rng(s) for s in (0, 1)] for _ in range(2)]
     ends = [gentle, behind, sharp]
-    plain, other = (draw(kind, ends, *rng) for kind, rng in zip(("bezier", "clothoid"), rngs, strict=True))
+    plain, other = (draw(kind, ends, np.random.default_rng(0)) for kind in ("bezier", "clothoid"))
     assert [np.array_equal(a, b) for a, b in zip(plain, other, strict=True)] == [True, True, False]
 
 
@@ -94,8 +93,8 @@ def test_bumps_have_the_stated_standard_deviation() -> None:
 
     Standard error of a standard deviation from n draws: 1 / sqrt(2 n)."""
     ends = [Ends(np.zeros(2), np.array([30.0, 0.0]), np.array([1.0, 0.0]), np.array([1.0, 0.0]), 0.0)] * 4000
-    rng, own = (np.random.default_rng(s) for s in (0, 1))
-    push = np.array([np.interp([7.5, 15.0], *course.T) for course in draw("bumps", ends, rng, own)])
+    drawn = draw("bumps", ends, np.random.default_rng(0))
+    push = np.array([np.interp([7.5, 15.0], *course.T) for course in drawn])
     expected = [BUMP_STD * math.sqrt(1 + 1.5**2 / 2) / 2, BUMP_STD]
     assert BUMP_STD == 0.4
     assert push.std(0) == pytest.approx(expected, rel=4 / math.sqrt(2 * len(push)))

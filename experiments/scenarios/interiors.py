@@ -41,19 +41,17 @@ class Ends(NamedTuple):
     turn: float
 
 
-def draw(kind: Kind, ends: list[Ends], rng: np.random.Generator, own: np.random.Generator) -> list[Floats]:
-    """One course (401, 2) for each interior.
-
-    Bezier handles come from `rng`, what the others add from `own`: kinds share the junction and what follows it."""
+def draw(kind: Kind, ends: list[Ends], rng: np.random.Generator) -> list[Floats]:
+    """One course (401, 2) for each interior. Every kind draws what the ones before it draw, then its own."""
     stretches = rng.uniform(*STRETCH, (len(ends), 2))
     courses = [bezier(e, stretch) for e, stretch in zip(ends, stretches, strict=True)]
     if kind == "bezier":
         return courses
-    shares = own.uniform(*SHARE, len(ends))
+    shares = rng.uniform(*SHARE, len(ends))
     courses = [clothoid(e, s) if fits(e) else course for e, s, course in zip(ends, shares, courses, strict=True)]
     if kind == "clothoid":
         return courses
-    heights = BUMP_STD * own.standard_normal((len(ends), 2))
+    heights = BUMP_STD * rng.standard_normal((len(ends), 2))
     return [bumped(course, height) for course, height in zip(courses, heights, strict=True)]
 
 

@@ -6,7 +6,7 @@
 The papers do not publish their junctions. Ours: 3 to 6 arms of 60 m at least 25 degrees apart, gap
 U(0, 4) m, 1 to 4 entries and exits of 2.7 m, turns up to 130 degrees, interiors that are cubic
 Bezier curves (or others, see `interiors`). Seeds 0 to 999 are the frozen 1000 scenes; geometry,
-vehicles, noise and other interiors have their own streams, so that an option changes nothing but itself.
+vehicles and noise have their own streams, so that an option changes nothing but itself.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def protocol(
     if interior not in get_args(interiors.Kind):
         known = ", ".join(get_args(interiors.Kind))
         raise InputError(f"scenario protocol: interior is '{interior}'; choose one of {known}")
-    geometry, vehicles, view, own = np.random.SeedSequence(seed).spawn(4)
-    truth = random_junction(np.random.default_rng(geometry), max_lanes, interior, np.random.default_rng(own))
+    geometry, vehicles, view = np.random.SeedSequence(seed).spawn(3)
+    truth = random_junction(np.random.default_rng(geometry), max_lanes, interior)
     data, track_lane = drive(truth.lines, vehicles, position_std, heading_std, tracks)
     if occlusion:
         data, track_lane = occlude(data, track_lane, truth, np.random.default_rng(view))
@@ -122,12 +122,8 @@ def drive(
 # A random junction
 
 
-def random_junction(
-    rng: np.random.Generator, max_lanes: int, interior: interiors.Kind, own: np.random.Generator
-) -> JunctionTruth:
-    """Draw arms, lanes, the connections between them and their centre lines; no vehicle yet.
-
-    own  stream of what interiors other than Bezier curves draw"""
+def random_junction(rng: np.random.Generator, max_lanes: int, interior: interiors.Kind) -> JunctionTruth:
+    """Draw arms, lanes, the connections between them and, at last, their centre lines; no vehicle yet."""
     angle = _draw_angles(rng)
     arms = len(angle)
     entries, exits = rng.integers(1, max_lanes + 1, (2, arms))
@@ -138,7 +134,7 @@ def random_junction(
     truth = JunctionTruth(
         centre, angle, gap, entries, exits, width, radius, [], connections, np.zeros(0, dtype=np.int64)
     )
-    courses = interiors.draw(interior, [_ends(truth, connection) for connection in connections], rng, own)
+    courses = interiors.draw(interior, [_ends(truth, connection) for connection in connections], rng)
     lines = [_line(truth, connection, course) for connection, course in zip(connections, courses, strict=True)]
     return truth._replace(lines=lines)
 

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotri
 
 from inference.posterior import Posterior, Snapshots
 from models.capability import HasSquares, Squares
@@ -27,7 +28,7 @@ from models.program import InputError
 Array = NDArray[np.float64]
 TRUST = 4.0  # numbers that the configured scale counts for
 WIDEST = 20.0  # learnt scales stay within a fifth and this multiple of the configured ones
-FIRST_LEARNT = 2  # step from which scales are learnt
+LEARNT_AFTER = (2, 4, 7, 11, 16, 22)  # steps: the inverse that learning needs costs as much as several of them
 
 
 class State(NamedTuple):
@@ -72,10 +73,11 @@ def minimise(
     for number in range(num_steps):
         hessian = state.hessian.copy()
         hessian[np.diag_indices(len(x))] *= 1.0 + damping
-        move = -cho_solve(cho_factor(hessian, lower=True, check_finite=False), state.gradient, check_finite=False)
+        factor = cho_factor(hessian, lower=True, check_finite=False)
+        move = -cho_solve(factor, state.gradient, check_finite=False)
         promise = float(-state.gradient @ move - 0.5 * move @ state.hessian @ move)
         converged = promise <= tolerance
-        if converged and number > FIRST_LEARNT:
+        if converged and (not learn or number > LEARNT_AFTER[1]):
             break
         new = linearise(squares, scale, state.x + move)
         gain = state.cost - new.cost
@@ -84,15 +86,16 @@ def minimise(
             state, growth = new, 2.0
         else:
             damping, growth = damping * growth, 2.0 * growth
-        if learn and number >= FIRST_LEARNT:
-            state, scale = relearn(squares, state, scale, learn)
+        if learn and number in LEARNT_AFTER:
+            state, scale = relearn(squares, state, scale, np.diag(dpotri(factor[0], lower=1)[0]), learn)
         visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
     return Path(state, scale, visited, converged)
 
 
-def relearn(squares: Squares, state: State, scale: Array, learn: tuple[str, ...]) -> tuple[State, Array]:
-    """The same latents under learnt prior scales: (state, scale (D,))."""
-    variance = np.linalg.inv(state.hessian).diagonal()
+def relearn(
+    squares: Squares, state: State, scale: Array, variance: Array, learn: tuple[str, ...]
+) -> tuple[State, Array]:
+    """The same latents under learnt prior scales: (state, scale (D,)); variance (D,) of x in the posterior."""
     new = scale.copy()
     for name in learn:
         part = squares.sites[name]
@@ -125,6 +128,8 @@ def run(
     """Minimise, then draw from the Laplace posterior, as inference.least_squares.run does and says."""
     began = time.perf_counter()
     squares = model.squares(evidence)
+    if init is None and hasattr(model, "start"):
+        init = model.start(evidence)
     x = np.zeros(len(squares.loc)) if init is None else (squares.pack(init) - squares.loc) / squares.scale
     path = minimise(squares, x, num_steps=num_steps, damping=damping, tolerance=tolerance, learn=learn)
     factor = np.linalg.cholesky(path.state.hessian)

@@ -60,6 +60,7 @@ class CourseEvidence(NamedTuple):
     counts       (L, 3) nodes on the entry arm, pieces of the interior, nodes on the exit arm
     origin       (2,) [m]
     heading      whether headings were measured
+    first        {site: value} where the structure itself is another than loc
     """
 
     points: Tensor
@@ -73,6 +74,7 @@ class CourseEvidence(NamedTuple):
     counts: Ints
     origin: Array
     heading: bool
+    first: dict[str, Array]
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,11 @@ class LaneCourses:
     def prepare(self, routed: RoutedTracks) -> CourseEvidence:
         """Evidence of this model. Raises InputError where no track is on a route."""
         return course_evidence(routed, self)
+
+    def start(self, evidence: CourseEvidence) -> dict[str, Array]:
+        """A first state: widths and bends of the structure as far as the prior likes them, all else at its middle."""
+        near = {n: np.clip(v, *(getattr(self, f"{n}_std") * np.array([-2.0, 2.0]))) for n, v in evidence.first.items()}
+        return {n: near.get(n, evidence.loc[n]) for n in SITES if getattr(self, f"{n}_std") > 0}
 
     def squares(self, evidence: CourseEvidence) -> Squares:
         """The same density as a compiled sum of squares."""
@@ -252,7 +259,12 @@ def course_evidence(routed: RoutedTracks, model: LaneCourses) -> CourseEvidence:
     reach = farthest(points, tracks.offsets, order, track_route, connections, loc["angle"])
     counts = node_counts(loc, connections, reach, model.spacing)
     table = (tracks.offsets.astype(np.int64), order, starts, connections.astype(np.int64), stubs.astype(np.int64))
-    return CourseEvidence(torch.from_numpy(points), *table, loc, reach, counts, origin, tracks.heading is not None)
+    arms = slice(int(structure["num_arms"]))
+    first = {"width": np.asarray(structure["width"], dtype=np.float64)[arms] - loc["lane_width"]}
+    if "bend" in structure:
+        first["bend"] = np.asarray(structure["bend"], dtype=np.float64)[arms]
+    measured = tracks.heading is not None
+    return CourseEvidence(torch.from_numpy(points), *table, loc, reach, counts, origin, measured, first)
 
 
 def prior_middles(structure: Mapping[str, Any], connections: Ints, num_stubs: int) -> dict[str, Array]:

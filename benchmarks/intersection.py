@@ -31,9 +31,10 @@ REFERENCE = fig.Figure(
 
 def measurements() -> tuple[fig.Measurement, ...]:
     """All measurements but the yardstick, in the order of the table."""
-    from benchmarks import junction_likelihoods, junction_speed, junction_structure
+    from benchmarks import junction_lanes, junction_likelihoods, junction_speed, junction_structure
 
-    return (*junction_speed.MEASUREMENTS, *junction_structure.MEASUREMENTS, *junction_likelihoods.MEASUREMENTS)
+    parts = (junction_speed, junction_structure, junction_likelihoods, junction_lanes)
+    return tuple(measurement for part in parts for measurement in part.MEASUREMENTS)
 
 
 def select(only: list[str]) -> list[fig.Measurement]:

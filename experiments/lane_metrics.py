@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from experiments.lanes import Lanes
 from experiments.scenarios import paths
-from experiments.scenarios.scene import JunctionTruth
+from experiments.scenarios.scene import JunctionTruth, Scene
+from inference.posterior import Posterior
 from models.program import InputError
 
 Floats = NDArray[np.float64]
@@ -75,6 +77,40 @@ def lane_error(lines: list[Floats], truth: JunctionTruth) -> dict[str, float]:
         "inside_cm": 100.0 * float(np.mean(inside)) if inside else math.nan,
         "arms_cm": 100.0 * float(np.mean(arms)) if arms else math.nan,
     }
+
+
+def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
+    """`lane_error` and `band_coverage` of a posterior with lanes; nothing without lanes or without a truth."""
+    lanes = getattr(posterior, "lanes", None)
+    if lanes is None or scene.truth is None:
+        return {}
+    return lane_error(lanes.lines, scene.truth) | {"band_coverage": band_coverage(lanes, scene.truth)}
+
+
+def band_coverage(lanes: Lanes, truth: JunctionTruth) -> float:
+    """Share of the nodes of all estimated lanes between whose 90 % band's edges the true line runs.
+
+    A lane's true line is the one that most of its tracks drove; nodes beyond the ends of that line are left out.
+    nan where no lane has one."""
+    inside = []
+    for number, (line, left, right) in enumerate(zip(lanes.lines, lanes.left, lanes.right, strict=True)):
+        drove = truth.track_lane[lanes.routes.track_route == number]
+        if (drove >= 0).any():
+            offset = _offset(line, truth.lines[np.bincount(drove[drove >= 0]).argmax()])
+            inside.append(((offset <= left) & (offset >= -right))[~np.isnan(offset)])
+    joined = np.concatenate(inside) if inside else np.zeros(0)
+    return float(joined.mean()) if len(joined) else math.nan
+
+
+def _offset(line: Floats, true: Floats) -> Floats:
+    """How far to the left of each point of a line the true one runs, nan beyond its ends, (n,) [m]."""
+    heading = paths.headings(line)
+    apart = true[None] - line[:, None]  # (n, m, 2)
+    nearest = (apart**2).sum(-1).argmin(1)
+    gap = apart[np.arange(len(line)), nearest]
+    offset = -np.sin(heading) * gap[:, 0] + np.cos(heading) * gap[:, 1]
+    end = (nearest < DROPPED / 0.25) | (nearest > len(true) - 1 - DROPPED / 0.25)
+    return np.where(end, np.nan, offset)
 
 
 def region(line: Floats) -> Floats:

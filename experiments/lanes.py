@@ -1,7 +1,8 @@
 """Structure, then lanes: an engine made of two.
 
 The structure engine finds arms and lane counts; every track is put on the entry and the exit lane it most probably
-drove; the refining engine then estimates the courses of all lanes together.
+drove; routes that turn out to be one lane are merged; the refining engine then estimates the courses of all lanes
+together.
 
     waybayes experiment=lanes                      a simulated junction, lane by lane
     waybayes experiment=lanes scenario.seed=3 engine.courses.heading_std=0.2
@@ -22,6 +23,7 @@ from inference.posterior import Posterior
 from models.intersection.courses import CourseEvidence, LaneCourses, centre_lines, lane_bands
 from models.intersection.evidence import JunctionEvidence
 from models.intersection.routes import RoutedTracks, Routes, find_routes
+from models.intersection.same_lane import merge_routes
 from models.intersection.state import Junction
 from models.program import InputError
 
@@ -110,4 +112,7 @@ def refine_lanes(
     routes = find_routes(model, evidence, found.estimate)
     structure = found.estimate | {n: np.full(len(found.estimate["angle"]), v) for n, v in model.constants.items()}
     course_evidence = courses.prepare(RoutedTracks(evidence.tracks, structure, routes))
+    merged = merge_routes(course_evidence, routes, courses.spacing)
+    if len(merged.connections) < len(routes.connections):
+        routes, course_evidence = merged, courses.prepare(RoutedTracks(evidence.tracks, structure, merged))
     return refine(courses, course_evidence, seed=seed), course_evidence, routes

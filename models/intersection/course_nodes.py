@@ -41,14 +41,15 @@ SHARPEST = 2.9  # [rad] of turn: sharper ones keep these handles
 WAVE_BEGIN, WAVE_PIECE, WAVE_PIECES = 8.0, 8.0, 7  # [m] from the centre; straight on before and beyond
 ARM_WAVE = WAVE_PIECES + 3  # controls
 INNER_WAVE = 6  # controls, those of INNER_WAVE + 3 pieces that vanish at both ends
-WAVES = 4 * ARM_WAVE + INNER_WAVE  # after the LOCAL numbers: arm and lane of the entry, of the exit, then the interior
+RIPPLED = LOCAL + INNER_WAVE  # numbers of a lane with a wave of its interior ...
+WAVY = RIPPLED + 4 * ARM_WAVE  # ... and with those of the entry arm, its lane, the exit arm and its lane, too
 
 
 @nb.njit(error_model="numpy")
 def arm_point(v, end, lane, t, point, tangent, slopes):  # type: ignore[no-untyped-def]
     """Point at distance t out on an arm and its outward tangent d + bend (t - CHORD / 2) n, with their derivatives.
 
-    v       (LOCAL,) numbers of the lane, or (LOCAL + WAVES,) with waves
+    v       (LOCAL,) numbers of the lane; (RIPPLED,) or (WAVY,) with waves
     slopes  (len(v) + 1, 4) of (point, tangent); the last row is the derivative in t"""
     o, side = HEAD + END * end, 1.0 - 2.0 * end
     dx, dy = math.cos(v[o + ANGLE]), math.sin(v[o + ANGLE])
@@ -58,8 +59,8 @@ def arm_point(v, end, lane, t, point, tangent, slopes):  # type: ignore[no-untyp
     across = v[o + SHIFT] + v[o + OFFSET] + 0.5 * side * v[o + GAP] + rank * (v[2] + v[o + WIDTH]) + v[o + BEND] * arch
     slope, curve = v[o + BEND] * lean, v[o + BEND]
     slopes[:] = 0.0
-    if len(v) > LOCAL:
-        first = LOCAL + 2 * ARM_WAVE * end
+    if len(v) > RIPPLED:
+        first = RIPPLED + 2 * ARM_WAVE * end
         across, slope, curve = add_waves(v, first, t, nx, ny, slopes, across, slope, curve)
     point[0], point[1] = v[0] + t * dx + across * nx, v[1] + t * dy + across * ny
     tangent[0], tangent[1] = dx + slope * nx, dy + slope * ny
@@ -187,7 +188,7 @@ def interior_nodes(v, lanes, num, nodes, first):  # type: ignore[no-untyped-def]
 @nb.njit(error_model="numpy")
 def ripple(v, u, speed, node):  # type: ignore[no-untyped-def]
     """Add the wave of the interior at parameter u, where the Bezier curve has this speed, to its node."""
-    first, weights, num = LOCAL + 4 * ARM_WAVE, np.empty((3, ORDER)), INNER_WAVE + 6
+    first, weights, num = LOCAL, np.empty((3, ORDER)), INNER_WAVE + 6
     piece = spline_weights(u, 0.0, 1.0 / (num - 3), num, weights[0], weights[1])
     spline_bows(u, 0.0, 1.0 / (num - 3), num, weights[2])
     across = slope = curve = 0.0
@@ -208,7 +209,7 @@ def ripple(v, u, speed, node):  # type: ignore[no-untyped-def]
 def course_nodes(v, lanes, reach, counts, nodes):  # type: ignore[no-untyped-def]
     """All nodes of a lane in driving order; returns how many.
 
-    v       (LOCAL,) numbers of the lane, or (LOCAL + WAVES,) with waves
+    v       (LOCAL,) numbers of the lane; (RIPPLED,) or (WAVY,) with waves
     lanes   (2,) number of its entry lane and of its exit lane on their arms
     reach   (2,) distance from the centre to which it is known on either arm
     counts  (3,) nodes on the entry arm, pieces of the interior, nodes on the exit arm

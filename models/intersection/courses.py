@@ -19,7 +19,7 @@ fits one B-spline to every lane and ties neighbours on an arm together by their 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -36,7 +36,7 @@ from torch.distributions import constraints
 from models.capability import Squares
 from models.intersection.borders import BEYOND, FARTHEST, interior_radius
 from models.intersection.course_kernel import centre_line, normal_equations
-from models.intersection.course_nodes import ARM_WAVE, END, INNER_WAVE, LOCAL, WAVES
+from models.intersection.course_nodes import ARM_WAVE, END, HEAD, INNER_WAVE, LOCAL, RIPPLED, WAVY
 from models.intersection.routes import RoutedTracks
 from models.program import InputError
 
@@ -44,7 +44,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 ARM_SITES = ("angle", "gap", "width", "bend", "shift", "onset")
 PLAIN = ("centre", "lane_width", *ARM_SITES, "offset", "advance", "handle")
-SITES = (*PLAIN, "arm_wave", "lane_wave", "inner_wave")
+SITES = (*PLAIN, "inner_wave", "arm_wave", "lane_wave")
+WIDTHS = {len(PLAIN): LOCAL, len(PLAIN) + 1: RIPPLED, len(SITES): WAVY}  # numbers of a lane, by how many sites
 
 
 class CourseEvidence(NamedTuple):
@@ -107,9 +108,9 @@ class LaneCourses:
         pyro.sample("points", PointsOnCourses(self, evidence, latents), obs=evidence.points)
 
     @property
-    def waves(self) -> bool:
-        """Whether any wave is latent."""
-        return max(self.arm_wave_std, self.lane_wave_std, self.inner_wave_std) > 0.0
+    def sites(self) -> tuple[str, ...]:
+        """The sites that lanes are computed from: waves only as far as any is latent, which is quicker."""
+        return needed(name for name in SITES if getattr(self, f"{name}_std") > 0)
 
     def prepare(self, routed: RoutedTracks) -> CourseEvidence:
         """Evidence of this model. Raises InputError where no track is on a route."""
@@ -131,7 +132,7 @@ class LaneCourses:
         scale = [np.full(part.stop - part.start, getattr(self, f"{name}_std")) for name, part in sites.items()]
         loc = np.concatenate([evidence.loc[name].reshape(-1) for name in sites])
         held = {name: value for name, value in evidence.loc.items() if name not in sites}
-        whole = Layout(evidence, self.waves)
+        whole = Layout(evidence, self.sites)
         index = np.concatenate([np.arange(whole.sites[name].start, whole.sites[name].stop) for name in sites])
         base = whole.pack(held | evidence.loc)
         data = evidence_arrays(self, evidence)
@@ -139,35 +140,37 @@ class LaneCourses:
         return Squares(loc, np.concatenate(scale), sites, shapes, evaluate, log_constant(self, evidence))
 
 
+def needed(latent: Iterable[str]) -> tuple[str, ...]:
+    """The sites that lanes are computed from where these are latent: the first ones, in blocks."""
+    last = max((SITES.index(name) for name in latent), default=0)
+    return SITES[: next(num for num in WIDTHS if num > last)]
+
+
 class Layout:
-    """All sites in one vector of numbers, constants included, and the part of it that each lane depends on.
+    """Sites in one vector of numbers, constants included, and the part of it that each lane depends on."""
 
-    Without waves these are left out: lanes are then quicker to compute."""
-
-    def __init__(self, evidence: CourseEvidence, waves: bool) -> None:
-        names = SITES if waves else PLAIN
-        sizes = [evidence.loc[name].size for name in names]
+    def __init__(self, evidence: CourseEvidence, sites: tuple[str, ...]) -> None:
+        sizes = [evidence.loc[name].size for name in sites]
         ends = np.cumsum([0, *sizes])
         self.size = int(ends[-1])
-        self.sites = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(names)}
+        self.sites = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(sites)}
         num = len(evidence.connections)
-        self.where = np.zeros((num, LOCAL + (WAVES if waves else 0)), np.int64)
-        self.where[:, 1] = 1
+        self.where = np.zeros((num, WIDTHS[len(sites)]), np.int64)
+        self.where[:, 1], self.where[:, 2] = 1, self.sites["lane_width"].start
         for end in range(2):
-            first, arm = 3 + END * end, evidence.connections[:, 2 * end]
-            self.where[:, 2] = self.sites["lane_width"].start
+            first, arm = HEAD + END * end, evidence.connections[:, 2 * end]
             for field, name in enumerate(ARM_SITES):
                 self.where[:, first + field] = self.sites[name].start + arm
             own = [self.sites["offset"].start + evidence.stubs[:, end]]
             own += [self.sites[name].start + 2 * np.arange(num) + end for name in ("advance", "handle")]
             self.where[:, first + len(ARM_SITES) : first + END] = np.stack(own, 1)
-            if waves:
-                first = LOCAL + 2 * ARM_WAVE * end
+            if "arm_wave" in sites:
+                first = RIPPLED + 2 * ARM_WAVE * end
                 self.where[:, first : first + ARM_WAVE] = self._rows("arm_wave", arm, ARM_WAVE)
                 first += ARM_WAVE
                 self.where[:, first : first + ARM_WAVE] = self._rows("lane_wave", evidence.stubs[:, end], ARM_WAVE)
-        if waves:
-            self.where[:, LOCAL + 4 * ARM_WAVE :] = self._rows("inner_wave", np.arange(num), INNER_WAVE)
+        if "inner_wave" in sites:
+            self.where[:, LOCAL:RIPPLED] = self._rows("inner_wave", np.arange(num), INNER_WAVE)
 
     def _rows(self, name: str, rows: Ints, width: int) -> Ints:
         return np.asarray(self.sites[name].start + width * rows[:, None] + np.arange(width))
@@ -219,7 +222,7 @@ class PointsOnCourses(TorchDistribution):
     support = constraints.independent(constraints.real, 2)
 
     def __init__(self, model: LaneCourses, evidence: CourseEvidence, latents: dict[str, Tensor]) -> None:
-        self.model, self.evidence, self.layout = model, evidence, Layout(evidence, model.waves)
+        self.model, self.evidence, self.layout = model, evidence, Layout(evidence, model.sites)
         events = {name: evidence.loc[name].ndim for name in self.layout.sites}
         latents = {name: latents[name] for name in events}
         batch = torch.broadcast_shapes(*(v.shape[: v.dim() - events[n]] for n, v in latents.items()))
@@ -314,8 +317,8 @@ def centre_lines(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[A
 
 
 def layout_of(evidence: CourseEvidence, latents: Mapping[str, Any]) -> Layout:
-    """The layout of a state: with waves where it has any."""
-    return Layout(evidence, any(name in latents for name in SITES if name not in PLAIN))
+    """The layout of a state, with the waves it has."""
+    return Layout(evidence, needed(name for name in SITES if name in latents))
 
 
 def lane_nodes(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[Array]:

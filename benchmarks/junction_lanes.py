@@ -6,7 +6,7 @@ import math
 import tempfile
 import time
 from collections.abc import Iterable
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any, NamedTuple
@@ -51,25 +51,21 @@ class LaneTrial(NamedTuple):
     refine: float
 
 
-PLAIN = LaneSetting(
-    DEFAULT,
-    LaneCourses(),
-    {"num_steps": 6, "tolerance": 0.1, "learn": ("advance", "handle", "width", "bend"), "num_draws": 1},
-)
-WAVY = PLAIN._replace(
-    courses=LaneCourses(inner_wave_std=0.05), knobs=PLAIN.knobs | {"learn": (*PLAIN.knobs["learn"], "inner_wave")}
-)
-
-
-def real_lanes() -> LaneSetting:
-    """The configs model=junction_real and engine=lanes_real, in as many steps as a benchmark has time for."""
+def lane_setting(engine: str, structure: Setting) -> LaneSetting:
+    """The config engine=ENGINE, in as many steps as a benchmark has time for."""
     from hydra import compose, initialize_config_module
     from hydra.utils import instantiate
 
     with initialize_config_module("configs", version_base="1.3"):
-        engine = compose("run", ["engine=lanes_real"]).engine
-    knobs = {"num_steps": 12, "tolerance": 0.1, "learn": tuple(engine.refine.learn), "num_draws": 1}
-    return LaneSetting(DEFAULT._replace(model=configured("junction_real")), instantiate(engine.courses), knobs)
+        config = compose("run", [f"engine={engine}"]).engine
+    knobs = {"num_steps": 12, "tolerance": 0.1, "learn": tuple(config.refine.learn), "num_draws": 1}
+    return LaneSetting(structure, instantiate(config.courses), knobs)
+
+
+@lru_cache
+def default() -> LaneSetting:
+    """Structure as structure_5000, lanes as engine=lanes."""
+    return lane_setting("lanes", DEFAULT)
 
 
 def refine(setting: LaneSetting, scene: Scene, seed: int) -> LaneTrial:
@@ -128,7 +124,7 @@ def on_protocol(setting: LaneSetting, num: int, what: str, show: bool, **options
 
 
 def main_lanes(effort: Effort) -> Values:
-    scores = on_protocol(PLAIN, effort.scenes, "lane_cm_5000", effort.show)
+    scores = on_protocol(default(), effort.scenes, "lane_cm_5000", effort.show)
     times = {
         "ms_total_5000": [t.structure + t.refine for t in scores.trials],
         "ms_refine": [t.refine for t in scores.trials],
@@ -137,10 +133,11 @@ def main_lanes(effort: Effort) -> Values:
     return {"lane_cm_5000": scores.value} | medians
 
 
-def variant(key: str, definition: str, setting: LaneSetting, at_most: float | None, **options: Any) -> Measurement:
+def variant(key: str, definition: str, at_most: float, structure: Setting = DEFAULT, **options: Any) -> Measurement:
     """A lane error on the protocol."""
 
     def measure(effort: Effort) -> Values:
+        setting = default()._replace(structure=structure)
         return {key: on_protocol(setting, effort.scenes // 2, key, effort.show, **options).value}
 
     return Measurement((Figure(key, "cm", definition, at_most=at_most),), measure)
@@ -160,8 +157,8 @@ def papers(effort: Effort) -> Values:
     with Progress("m20_lane_cm", effort.few, effort.show) as bar:
         for seed in range(effort.few):
             scene = protocol(seed)
-            trial = refine(PLAIN, scene, seed)
-            model = PLAIN.structure.model
+            trial = refine(default(), scene, seed)
+            model = default().structure.model
             constants = {n: np.full(len(trial.found.estimate["angle"]), v) for n, v in model.constants.items()}
             routed = RoutedTracks(scene.data, trial.found.estimate | constants, trial.lanes.routes)
             for name, result in (("m20", m20_refine(routed)), ("m19", m19_refine(routed, seed))):
@@ -180,7 +177,8 @@ def real(effort: Effort) -> Values:
     keys = ("real_lane_cm", "real_lane_cm_heading", "real_lane_cm_each", "real_ms")
     if not Path(DATA).exists():
         return {key: Value(None, "the data folder is absent") for key in keys}
-    setting, clean = real_lanes(), names("clean", DATA)
+    on_real = DEFAULT._replace(model=configured("junction_real"))
+    setting, clean = lane_setting("lanes_real", on_real), names("clean", DATA)
     each: dict[str, float] = {}
     trials: list[LaneTrial] = []
     errors: dict[float | None, list[float]] = {None: [], HEADING_STD: []}
@@ -206,7 +204,7 @@ def real(effort: Effort) -> Values:
 
 def coverage(effort: Effort) -> Values:
     """How often the true lines run inside the bands."""
-    setting = PLAIN._replace(knobs=PLAIN.knobs | {"num_steps": 30, "tolerance": 1e-3, "num_draws": 500})
+    setting = default()._replace(knobs=default().knobs | {"num_steps": 30, "tolerance": 1e-3, "num_draws": 500})
     given, every = [], []
     for seed in range(effort.few):
         scene = protocol(seed)
@@ -234,7 +232,7 @@ def lanelets(effort: Effort) -> Values:
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(effort.few):
-            trial = refine(PLAIN, protocol(seed), seed)
+            trial = refine(default(), protocol(seed), seed)
             exported = lanelet_map(trial.lanes.lines, trial.lanes.routes.connections)
             path = Path(folder) / f"{seed}.osm"
             write_osm(path, exported)
@@ -260,27 +258,24 @@ MEASUREMENTS = (
     variant(
         "lane_cm_10000",
         "as lane_cm_5000 on half the scenes, structure as structure_10000",
-        PLAIN._replace(structure=with_steps(DEFAULT, 10000)),
         4.7,
+        with_steps(DEFAULT, 10000),
     ),
     variant(
         "lane_cm_heading_5000",
         "as lane_cm_5000 on half the scenes, headings measured with sd .1 rad",
-        PLAIN,
         4.1,
         heading_std=HEADING_STD,
     ),
     variant(
         "lane_cm_mismatch",
-        "as lane_cm_5000 on half the scenes, interiors clothoid-arc-clothoid with bumps of sd .4 m, their waves latent",
-        WAVY,
+        "as lane_cm_5000 on half the scenes, interiors clothoid-arc-clothoid with bumps of sd .4 m",
         6.2,
         interior="bumps",
     ),
     variant(
         "lane_cm_mismatch_heading",
         "the same, headings measured with sd .1 rad",
-        WAVY,
         5.0,
         interior="bumps",
         heading_std=HEADING_STD,

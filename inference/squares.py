@@ -55,8 +55,9 @@ def linearise(squares: Squares, scale: Array, x: Array) -> State:
     cost = squares.evaluate(squares.loc + scale * x, hessian, gradient)
     if not np.isfinite(cost):
         raise FloatingPointError(f"the sum of squares is {cost} at {squares.unpack(squares.loc + scale * x)}")
-    hessian = scale[:, None] * hessian * scale
-    hessian[np.diag_indices(len(x))] += 1.0
+    hessian *= scale
+    hessian *= scale[:, None]
+    hessian.ravel()[:: len(x) + 1] += 1.0
     return State(x, cost + 0.5 * float(x @ x), x + scale * gradient, hessian)
 
 
@@ -72,8 +73,8 @@ def minimise(
     visited = [(time.perf_counter() - began, state.cost, squares.loc + scale * x)]
     for number in range(num_steps):
         hessian = state.hessian.copy()
-        hessian[np.diag_indices(len(x))] *= 1.0 + damping
-        factor = cho_factor(hessian, lower=True, check_finite=False)
+        hessian.ravel()[:: len(x) + 1] *= 1.0 + damping
+        factor = cho_factor(hessian, lower=True, overwrite_a=True, check_finite=False)
         move = -cho_solve(factor, state.gradient, check_finite=False)
         promise = float(-state.gradient @ move - 0.5 * move @ state.hessian @ move)
         converged = promise <= tolerance

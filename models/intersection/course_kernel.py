@@ -99,10 +99,11 @@ def residual_columns(nodes, num, noise, sums, columns):  # type: ignore[no-untyp
 
 
 @nb.njit(cache=True, error_model="numpy")
-def normal_equations(z, where, lanes, reach, counts, tracks, starts, offsets, points, noise, hessian, gradient):  # type: ignore[no-untyped-def]
-    """Cost of all points, its gradient (D,) and Gauss-Newton Hessian (D, D) in z (D,).
+def normal_equations(z, where, slots, lanes, reach, counts, tracks, starts, offsets, points, noise, hessian, gradient):  # type: ignore[no-untyped-def]
+    """Cost of all points, its gradient (D,) and Gauss-Newton Hessian (D, D) in the latent ones of the numbers z.
 
-    where   (L, D') which of z each lane depends on; lanes, reach, counts as in `course_nodes`, for every lane
+    where   (L, D') which of z each lane depends on; slots (L, D') their places among the latent ones, -1 for a constant
+    lanes, reach, counts as in `course_nodes`, for every lane
     tracks  of lane l: tracks[starts[l]:starts[l + 1]]; track t holds points (3, N) offsets[t]:offsets[t + 1]"""
     most = 0
     for lane in range(len(where)):
@@ -123,11 +124,16 @@ def normal_equations(z, where, lanes, reach, counts, tracks, starts, offsets, po
             cost += sum_points(points, offsets[t], offsets[t + 1], nodes, num, noise, sums)
         square_columns(columns, residual_columns(nodes, num, noise, sums, columns), block)
         for p in range(size):
-            gradient[index[p]] += block[size, p]
-            for q in range(p + 1):
-                hessian[index[p], index[q]] += block[p, q]
-                if p != q:
-                    hessian[index[q], index[p]] += block[p, q]
+            i = slots[lane, p]
+            if i >= 0:
+                gradient[i] += block[size, p]
+                for q in range(p + 1):
+                    k = slots[lane, q]
+                    if k >= 0:  # on a U-turn both ends share an arm: its numbers meet themselves twice
+                        hessian[max(i, k), min(i, k)] += 2.0 * block[p, q] if i == k and p != q else block[p, q]
+    for i in range(len(gradient)):
+        for k in range(i):
+            hessian[k, i] = hessian[i, k]
     return cost
 
 

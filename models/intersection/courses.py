@@ -95,7 +95,7 @@ class LaneCourses:
     handle_std: float = 0.15
     arm_wave_std: float = 0.0  # [m]
     lane_wave_std: float = 0.0  # [m]
-    inner_wave_std: float = 0.0  # [m]
+    inner_wave_std: float = 0.15  # [m]
     position_std: float = 1.0  # of a point, on each axis [m]
     heading_std: float = 0.1  # of a measured heading [rad]
     spacing: float = 1.0  # of the nodes [m]
@@ -136,7 +136,9 @@ class LaneCourses:
         index = np.concatenate([np.arange(whole.sites[name].start, whole.sites[name].stop) for name in sites])
         base = whole.pack(held | evidence.loc)
         data = evidence_arrays(self, evidence)
-        evaluate = partial(_evaluate, base, index, whole.where, data)
+        slots = np.full(whole.size, -1)
+        slots[index] = np.arange(len(index))
+        evaluate = partial(_evaluate, base, index, (whole.where, slots[whole.where], *data))
         return Squares(loc, np.concatenate(scale), sites, shapes, evaluate, log_constant(self, evidence))
 
 
@@ -198,18 +200,11 @@ def log_constant(model: LaneCourses, evidence: CourseEvidence) -> float:
     return num * each
 
 
-def _evaluate(
-    base: Array, index: Ints, where: Ints, data: tuple[Any, ...], z: Array, hessian: Array, gradient: Array
-) -> float:
+def _evaluate(base: Array, index: Ints, data: tuple[Any, ...], z: Array, hessian: Array, gradient: Array) -> float:
     """`normal_equations` in the numbers that are latent."""
     full = base.copy()
     full[index] = z
-    if len(index) == len(base):
-        return float(normal_equations(full, where, *data, hessian, gradient))  # type: ignore[call-arg]
-    all_hessian, all_gradient = np.empty((len(base), len(base))), np.empty(len(base))
-    cost = normal_equations(full, where, *data, all_hessian, all_gradient)  # type: ignore[call-arg]
-    hessian[:], gradient[:] = all_hessian[np.ix_(index, index)], all_gradient[index]
-    return float(cost)
+    return float(normal_equations(full, *data, hessian, gradient))  # type: ignore[call-arg]
 
 
 class PointsOnCourses(TorchDistribution):
@@ -235,9 +230,9 @@ class PointsOnCourses(TorchDistribution):
             raise InputError("lane courses score the tracks that their evidence was prepared from; prepare() others")
         data, constant = evidence_arrays(self.model, self.evidence), log_constant(self.model, self.evidence)
         size = self.layout.size
-        hessian, gradient = np.empty((size, size)), np.empty(size)
+        hessian, gradient = np.empty((0, 0)), np.empty(0)
         rows = self.numbers.detach().reshape(-1, size).numpy()
-        rest = (self.layout.where, *data, hessian, gradient)
+        rest = (self.layout.where, np.full_like(self.layout.where, -1), *data, hessian, gradient)
         costs = [normal_equations(z, *rest) for z in rows]  # type: ignore[call-arg]
         return constant - torch.tensor(costs, dtype=torch.float64).reshape(self.batch_shape)
 

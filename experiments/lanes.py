@@ -19,6 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.lanelet_osm import write_osm
+from experiments.lanelets import lanelet_map
 from inference.posterior import Posterior
 from models.intersection.courses import CourseEvidence, LaneCourses, centre_lines, lane_bands
 from models.intersection.evidence import JunctionEvidence
@@ -51,17 +53,20 @@ class Lanes(NamedTuple):
 class LanePosterior(Posterior):
     """The posterior of the structure, with the lanes on its best state.
 
-    lanes    centre lines with bands
-    first    the same lanes where their refinement began
-    courses  posterior of the refinement
+    lanes       centre lines with bands
+    first       the same lanes where their refinement began
+    lane_width  that arms have in common [m]
+    courses     posterior of the refinement
     """
 
     lanes: Lanes | None = None
     first: list[Array] | None = None
+    lane_width: float = 2.7
     courses: Posterior | None = None
 
     def save(self, folder: Path) -> None:
-        """posterior.npz and .json as ever, the lanes in lanes.npz, one array per lane: x, y, left, right."""
+        """posterior.npz and .json as ever; the lanes in lanes.npz, one array per lane: x, y, left, right; and as a
+        Lanelet2 map in lanes.osm."""
         super().save(folder)
         assert self.lanes is not None
         arrays = {
@@ -70,6 +75,8 @@ class LanePosterior(Posterior):
         }
         routes = self.lanes.routes._asdict()
         np.savez_compressed(folder / "lanes.npz", allow_pickle=False, **arrays, **routes)
+        width = float(self.lane_width)
+        write_osm(folder / "lanes.osm", lanelet_map(self.lanes.lines, self.lanes.routes.connections, width))
 
 
 def estimate(
@@ -99,6 +106,7 @@ def estimate(
         **fields | {"info": info},
         lanes=Lanes(lines, left, right, routes),
         first=centre_lines(course_evidence, {}),
+        lane_width=float(posterior.estimate["lane_width"]),
         courses=posterior,
     )
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from experiments.run import Result
 
 UNITS = {
-    "m": "m", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
+    "m": "m", "cm": "cm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
     "sd": "sd", "nats": "nats", "pct": "%", "hz": "Hz",
 }  # fmt: skip
 

@@ -86,15 +86,20 @@ def flags(posterior: Posterior, *, max_r_hat: float = 1.01, min_ess: float = 400
 
 
 def r_hat(draws: Array) -> float:
-    """Rank-normalised split R-hat of draws (chain, draw); NaN for a single chain and for constants."""
+    """Rank-normalised split R-hat of draws (chain, draw); NaN for a single chain and for constants.
+
+    Infinite where every half of a chain stands still, but not all at the same value."""
     if draws.shape[0] == 1 or np.ptp(draws) == 0:
         return float("nan")
-    return float(_arviz().rhat(draws))
+    half = draws.shape[1] // 2
+    if half and not np.ptp(draws[:, :half], axis=1).any() and not np.ptp(draws[:, -half:], axis=1).any():
+        return float("inf")  # 0 / 0 to ArviZ, or a huge number by rounding
+    return _quietly("rhat", draws)
 
 
 def standard_error(draws: Array) -> float:
     """Standard error of the mean of draws (chain, draw), autocorrelation included."""
-    return float(np.squeeze(_arviz().mcse(np.asarray(draws, dtype=np.float64), method="mean")))
+    return _quietly("mcse", np.asarray(draws, dtype=np.float64), method="mean")
 
 
 def model_probabilities(posterior: Posterior) -> dict[int, tuple[float, float]]:
@@ -105,7 +110,13 @@ def model_probabilities(posterior: Posterior) -> dict[int, tuple[float, float]]:
 
 
 def _ess(draws: Array) -> float:
-    return float(_arviz().ess(draws, method="bulk"))
+    return _quietly("ess", draws, method="bulk")
+
+
+def _quietly(name: str, draws: Array, **options: str) -> float:
+    """A statistic of ArviZ; chains that stand still are no news, so numpy says nothing of 0 / 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.squeeze(getattr(_arviz(), name)(draws, **options)))
 
 
 def _arviz() -> ModuleType:

@@ -45,6 +45,17 @@ def test_chains_apart_are_flagged_in_words() -> None:
     assert any(flag.startswith("r_hat of 'd0' is 1.") and "over 4 chains" in flag for flag in found)
 
 
+@pytest.mark.parametrize("values", [(3.0, 4.0, 3.0, 4.0), (0.1, 0.3, 0.1, 0.7)])
+def test_chains_that_stand_still_apart_are_flagged_without_warnings(
+    values: tuple[float, ...], recwarn: pytest.WarningsRecorder
+) -> None:
+    still = Posterior({"num_arms": np.repeat(np.array(values)[:, None], 500, axis=1)})
+    assert diagnostics.summary(still)["num_arms"]["r_hat"] == math.inf
+    found = diagnostics.flags(still)
+    assert found[0].startswith("r_hat of 'num_arms' is inf over 4 chains") and "the chains disagree" in found[0]
+    assert not [warning for warning in recwarn if warning.category is RuntimeWarning]
+
+
 def test_few_effective_draws_are_told() -> None:
     found = diagnostics.flags(Posterior({"d0": chains(0.9, 600)}), max_r_hat=2.0)
     assert len(found) == 1

@@ -225,7 +225,8 @@ def show(folder: Path) -> None:
     for flag in flags[:3]:
         console.print(f"flag       {flag}", style="yellow", soft_wrap=True, markup=False, highlight=False)
     if len(flags) > 3:
-        console.print(f"           and {len(flags) - 3} more flags in the report", style="yellow")
+        more = f"{len(flags) - 3} more flag{'s' if len(flags) > 4 else ''}"
+        console.print(f"           and {more} in the report", style="yellow")
     console.print(f"report     {folder / 'report.html'}", soft_wrap=True, highlight=False)
 
 

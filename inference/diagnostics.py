@@ -64,25 +64,34 @@ def summary(posterior: Posterior) -> dict[str, dict[str, float]]:
 
 
 def flags(posterior: Posterior, *, max_r_hat: float = 1.01, min_ess: float = 400.0) -> list[str]:
-    """What speaks against the draws, in words: the engine's own flags first, then R-hat and ESS."""
+    """What speaks against the draws, in words: the engine's own flags first, then R-hat and ESS.
+
+    Where the chains of a scalar disagree, its ESS is not told: the standard error would mislead."""
     found = list(posterior.info.get("flags", []))
     num_chains, num_draws = posterior.shape[:2]
     if num_draws < MIN_DRAWS:
-        return [*found, f"only {num_draws} draws a chain: convergence cannot be judged; keep at least {MIN_DRAWS}"]
+        few = f"only {num_draws} draw{'s' if num_draws > 1 else ''} a chain"
+        return [*found, f"{few}: convergence cannot be judged; keep at least {MIN_DRAWS}"]
     for label, row in summary(posterior).items():
         if row["sd"] == 0.0:
             continue  # a constant has neither R-hat nor ESS
         if row["r_hat"] > max_r_hat:
+            value = _above(row["r_hat"], max_r_hat)
             found.append(
-                f"r_hat of '{label}' is {row['r_hat']:.3g} over {num_chains} chains (above {max_r_hat}): "
+                f"r_hat of '{label}' is {value} over {num_chains} chains (above {max_r_hat}): "
                 "the chains disagree; run longer, or start and anneal them better"
             )
-        if not row["ess_bulk"] >= min_ess:  # NaN too
+        elif not row["ess_bulk"] >= min_ess:  # NaN too
             found.append(
                 f"'{label}' has {row['ess_bulk']:.0f} effective draws (below {min_ess:.0f}): "
                 f"its mean is known to {row['mcse']:.2g}; run longer if that is not enough"
             )
     return found
+
+
+def _above(value: float, limit: float) -> str:
+    """A value above a limit with three digits, or as many as show that it is above."""
+    return next(text for digits in range(3, 18) if float(text := f"{value:.{digits}g}") > limit)
 
 
 def r_hat(draws: Array) -> float:

@@ -42,7 +42,14 @@ def test_summary_holds_mean_sd_and_effective_draws_of_every_element() -> None:
 def test_chains_apart_are_flagged_in_words() -> None:
     apart = chains(0.0, 500) + np.array([[0.0], [0.0], [0.0], [3.0]])
     found = diagnostics.flags(Posterior({"d0": apart}))
-    assert any(flag.startswith("r_hat of 'd0' is 1.") and "over 4 chains" in flag for flag in found)
+    assert len(found) == 1  # nothing of a standard error that supposes agreement
+    assert found[0].startswith("r_hat of 'd0' is 1.") and "over 4 chains" in found[0]
+
+
+def test_an_r_hat_just_above_its_limit_shows_that_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnostics, "r_hat", lambda draws: 1.01034)
+    found = diagnostics.flags(Posterior({"d0": chains(0.0, 1000)}))
+    assert found[0].startswith("r_hat of 'd0' is 1.0103 over 4 chains (above 1.01)")
 
 
 @pytest.mark.parametrize("values", [(3.0, 4.0, 3.0, 4.0), (0.1, 0.3, 0.1, 0.7)])
@@ -71,7 +78,7 @@ def test_good_chains_and_constants_raise_no_flag() -> None:
 def test_too_few_draws_to_judge_are_told(num_chains: int, num_draws: int) -> None:
     found = diagnostics.flags(Posterior({"d0": chains(0.0, num_draws, num_chains=num_chains)}))
     assert len(found) == 1
-    assert f"only {num_draws} draws a chain: convergence cannot be judged" in found[0]
+    assert f"only {num_draws} draw{'s' * (num_draws > 1)} a chain: convergence cannot be judged" in found[0]
 
 
 def test_draws_whose_effective_size_is_unknown_are_told() -> None:

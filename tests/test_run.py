@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments import store
 from experiments.metrics import site_error
-from experiments.run import engine_seed, run
+from experiments.run import engine_seed, run, show
 from experiments.scenarios.toys import line, slot_road
 from inference.posterior import Posterior
 from models.intersection.state import Junction
@@ -46,6 +47,16 @@ def test_a_run_leaves_a_complete_folder_and_an_identical_one_is_skipped(launch: 
     assert third.returncode == 0, third.stderr
     assert len(Path("calls.txt").read_text().split()) == 2
     assert [path.name for path in Path("runs").iterdir()] == [folder.name]
+
+
+@pytest.mark.parametrize(("num", "words"), [(4, "and 1 more flag in"), (5, "and 2 more flags in")])
+def test_flags_past_the_third_are_counted(
+    num: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store.write_json(tmp_path / "scores.json", {})
+    store.write_json(tmp_path / "diagnostics.json", {"flags": ["why"] * num})
+    show(tmp_path)
+    assert words in capsys.readouterr().out
 
 
 def test_a_misspelt_key_is_refused_before_anything_is_written(launch: Command) -> None:

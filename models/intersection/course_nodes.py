@@ -46,21 +46,20 @@ WAVY = RIPPLED + 4 * ARM_WAVE  # ... and with those of the entry arm, its lane, 
 
 
 @nb.njit(error_model="numpy")
-def arm_point(v, end, lane, t, point, tangent, slopes):  # type: ignore[no-untyped-def]
-    """Point at distance t out on an arm and its outward tangent d + bend (t - CHORD / 2) n, with their derivatives.
+def arm_point(v, end, lane, t, dx, dy, point, tangent, slopes):  # type: ignore[no-untyped-def]
+    """Point at distance t out on an arm of direction d and its outward tangent d + bend (t - CHORD / 2) n, with their
+    derivatives; returns the bend there.
 
     v       (LOCAL,) numbers of the lane; (RIPPLED,) or (WAVY,) with waves
-    slopes  (len(v) + 1, 4) of (point, tangent); the last row is the derivative in t"""
-    o, side = HEAD + END * end, 1.0 - 2.0 * end
-    dx, dy = math.cos(v[o + ANGLE]), math.sin(v[o + ANGLE])
-    nx, ny = -dy, dx
+    slopes  (len(v) + 1, 4) of (point, tangent), zeros at first; the last row is the derivative in t"""
+    o, side, nx, ny = HEAD + END * end, 1.0 - 2.0 * end, -dy, dx
     arch, lean = 0.5 * t * (t - CHORD), t - 0.5 * CHORD
     rank = side * (lane + 0.5)
     across = v[o + SHIFT] + v[o + OFFSET] + 0.5 * side * v[o + GAP] + rank * (v[2] + v[o + WIDTH]) + v[o + BEND] * arch
     slope, curve = v[o + BEND] * lean, v[o + BEND]
-    slopes[:] = 0.0
     if len(v) > RIPPLED:
         first = RIPPLED + 2 * ARM_WAVE * end
+        slopes[first : first + 2 * ARM_WAVE] = 0.0
         across, slope, curve = add_waves(v, first, t, nx, ny, slopes, across, slope, curve)
     point[0], point[1] = v[0] + t * dx + across * nx, v[1] + t * dy + across * ny
     tangent[0], tangent[1] = dx + slope * nx, dy + slope * ny
@@ -110,7 +109,9 @@ def stretch(v, end):  # type: ignore[no-untyped-def]
 def interior_end(v, end, lane, point, tangent, slopes):  # type: ignore[no-untyped-def]
     """`arm_point` where the interior begins, onset and advance among the derivatives."""
     r, free = start_of_interior(v, end)
-    arm_point(v, end, lane, r, point, tangent, slopes)
+    angle = v[HEAD + END * end + ANGLE]
+    slopes[:] = 0.0
+    arm_point(v, end, lane, r, math.cos(angle), math.sin(angle), point, tangent, slopes)
     for field in (ONSET, ADVANCE):
         for j in range(4):
             slopes[HEAD + END * end + field, j] = free * slopes[len(v), j]
@@ -120,18 +121,25 @@ def interior_end(v, end, lane, point, tangent, slopes):  # type: ignore[no-untyp
 def arm_nodes(v, end, lane, reach, num, nodes, first):  # type: ignore[no-untyped-def]
     """`num` nodes from `reach` down to the interior of the entry arm, or outwards on the exit arm, from row `first`."""
     r, _ = start_of_interior(v, end)
-    point, tangent, slopes = np.empty(2), np.empty(2), np.empty((len(v) + 1, 4))
+    own, waves = HEAD + END * end, RIPPLED + 2 * ARM_WAVE * end
+    dx, dy = math.cos(v[own + ANGLE]), math.sin(v[own + ANGLE])
+    point, tangent, slopes = np.empty(2), np.empty(2), np.zeros((len(v) + 1, 4))
     forward = 2.0 * end - 1.0  # outward tangents point against the traffic of an entry
     for i in range(num):
         share = (num - i) / num if end == 0 else (i + 1) / num
-        curve = arm_point(v, end, lane, r + share * (reach - r), point, tangent, slopes)
+        bend = arm_point(v, end, lane, r + share * (reach - r), dx, dy, point, tangent, slopes)
         length = math.hypot(tangent[0], tangent[1])
         ux, uy = forward * tangent[0] / length, forward * tangent[1] / length
         node = nodes[first + i]
-        node[0], node[1], node[2], node[3] = point[0], point[1], ux, uy
-        node[4] = forward * curve / length**3
-        for p in range(len(v)):
+        node[:] = 0.0
+        node[0], node[1], node[2], node[3], node[4] = point[0], point[1], ux, uy, forward * bend / length**3
+        for p in range(HEAD):
             node[5 + p] = -uy * slopes[p, 0] + ux * slopes[p, 1]
+        for p in range(own, own + END):
+            node[5 + p] = -uy * slopes[p, 0] + ux * slopes[p, 1]
+        if len(v) > RIPPLED:
+            for p in range(waves, waves + 2 * ARM_WAVE):
+                node[5 + p] = -uy * slopes[p, 0] + ux * slopes[p, 1]
 
 
 @nb.njit(error_model="numpy")

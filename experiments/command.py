@@ -24,6 +24,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from experiments.schema import check_switch, check_values, expand, suggest
 from experiments.signatures import ConfigError
+from experiments.store import check_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -44,6 +45,8 @@ class SchemaLoader(ConfigLoaderImpl):
     ) -> DictConfig:
         config = super().load_configuration(config_name, overrides, *args, **kwargs)
         check_values(config)
+        if runs := OmegaConf.select(config, "runs"):
+            check_folder(Path(runs))  # now: Hydra makes it before the run begins
         for override in OverridesParser.create().parse_overrides(overrides):
             if not override.is_sweep_override() and not override.is_delete():
                 check_switch(config, override.key_or_group, override.value())

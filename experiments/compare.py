@@ -76,6 +76,8 @@ def plan(words: list[str]) -> Plan:
         if override.key_or_group == "engines":
             value = override.value()
             engines = [str(name) for name in (value if isinstance(value, list) else [value])]
+            if not engines:
+                raise ConfigError("engines is empty; name one or more, such as engines=[rjmcmc,least_squares]")
         elif override.key_or_group == "seeds":
             value = override.value()
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:

@@ -26,6 +26,7 @@ from omegaconf import DictConfig
 from experiments import store
 from experiments.command import Incomplete, JobFailed, complain, guarded, in_short, plain
 from experiments.schema import build
+from experiments.signatures import ConfigError
 
 if TYPE_CHECKING:  # torch and matplotlib take seconds to import: help and skipped runs need neither
     from matplotlib.figure import Figure
@@ -163,11 +164,28 @@ class Job(NamedTuple):
 
 
 def job_of(config: DictConfig, choices: dict[str, str]) -> Job:
-    """Where the outcome of a composed config belongs. Raises where a value cannot be resolved."""
+    """Where the outcome of a composed config belongs.
+
+    Raises where a value cannot be resolved, ConfigError for seeds and lists that no run can take."""
     settings = plain(config)
+    _check(settings)
     root, force = Path(settings.pop("runs")), settings.pop("force")
     title = "-".join(str(choices[part]) for part in ("scenario", "model", "engine"))
     return Job(settings, root / f"{title}-{store.identity(settings)}", force)
+
+
+def _check(settings: dict[str, Any]) -> None:
+    """Raise ConfigError for what would fail late, when the engine has worked for nothing."""
+    for name, seed in (("seed", settings["seed"]), ("scenario.seed", settings["scenario"].get("seed"))):
+        if isinstance(seed, int) and seed < 0:
+            raise ConfigError(f"{name} is {seed}; choose 0 or more")
+    for name in ("functionals", "metrics", "figures"):
+        value = settings[name]
+        if not isinstance(value, list) or not all(isinstance(v, dict) and v.get("_partial_") for v in value):
+            raise ConfigError(
+                f"{name} is '{value}'; give a list of functions, each {{_target_: module.function, _partial_: true}}, "
+                f"or {name}=[] for none"
+            )
 
 
 def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:

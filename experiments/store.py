@@ -25,7 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from experiments.signatures import source_of
+from experiments.signatures import ConfigError, source_of
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = ("models", "inference", "experiments")
@@ -61,6 +61,17 @@ def _strings(node: Any, key: str | None = None) -> Iterator[str]:
             yield value
         else:
             yield from _strings(value, key)
+
+
+def check_folder(runs: Path) -> None:
+    """Raise ConfigError where no runs can be stored below a folder, there or not; nothing is left behind."""
+    place = next(place for place in (runs, *runs.absolute().parents) if place.exists())
+    try:
+        tempfile.TemporaryDirectory(dir=place).cleanup()
+    except OSError as error:
+        raise ConfigError(
+            f"runs is '{runs}', but nothing can be written in '{place}' ({error.strerror}); choose another folder"
+        ) from None
 
 
 @contextmanager

@@ -36,9 +36,9 @@ def test_a_biased_engine_stands_out_and_a_broken_one_is_a_row(launch: Command) -
     assert len(Path("calls.txt").read_text().split()) == len(calls.split()) + 1  # the broken one alone
 
 
-@pytest.mark.parametrize("word", ["seeds=0", "seeds=two", "engine=rjmcmc", "seed=3"])
+@pytest.mark.parametrize("word", ["engines=[]", "seeds=0", "seeds=two", "engine=rjmcmc", "seed=3"])
 def test_words_that_a_comparison_does_not_take_are_refused(word: str) -> None:
-    with pytest.raises(ConfigError, match=r"seeds|engines=\[...\]"):
+    with pytest.raises(ConfigError, match=r"seeds|engines is empty|engines=\[...\]"):
         plan([word])
 
 

@@ -111,8 +111,9 @@ def test_a_bad_table_gets_one_sentence_with_file_place_and_remedy(case: str, tmp
 @pytest.mark.parametrize("heading_std", [None, 0.1])
 def test_written_tracks_are_read_again(tmp_path: Path, heading_std: float | None) -> None:
     tracks = protocol(0, heading_std=heading_std).data
-    write(tmp_path / "tracks.csv", tracks)
-    vehicles = read(tmp_path / "tracks.csv")
+    path = tmp_path / "a folder to make" / "tracks.csv"
+    write(path, tracks)
+    vehicles = read(path)
     np.testing.assert_allclose(np.concatenate([v.points for v in vehicles]), tracks.points, atol=1e-6)
     np.testing.assert_array_equal(np.cumsum([len(v.points) for v in vehicles]), tracks.offsets[1:])
     if heading_std:

@@ -66,6 +66,26 @@ def test_a_misspelt_key_is_refused_before_anything_is_written(launch: Command) -
     assert not Path("runs").exists() and not Path("calls.txt").exists()
 
 
+BAD_SETTINGS = {
+    "seed=-1": "seed is -1; choose 0 or more",
+    "scenario.seed=-1": "scenario.seed is -1; choose 0 or more",
+    "metrics=foo": "metrics is 'foo'; give a list of functions",
+    "metrics=[foo]": "metrics is '['foo']'; give a list of functions",
+    "figures=null": "figures is 'None'; give a list of functions",
+    "runs=calls.txt": "runs is 'calls.txt', but nothing can be written in 'calls.txt' (Not a directory)",
+    "runs=/proc/absent": "runs is '/proc/absent', but nothing can be written in '/proc'",
+}
+
+
+@pytest.mark.parametrize("word", BAD_SETTINGS)
+def test_settings_that_no_run_can_take_are_refused_before_the_engine(word: str, launch: Command) -> None:
+    Path("calls.txt").touch()
+    done = launch(*FAKE, word)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("\n") == 1 and BAD_SETTINGS[word] in done.stderr
+    assert Path("calls.txt").read_text() == ""
+
+
 def test_bad_input_is_one_sentence_and_leaves_nothing(launch: Command) -> None:
     done = launch(*FAKE, "scenario.num=0")
     assert done.returncode == 2

@@ -87,13 +87,14 @@ def _on_one_road(tracks: list[Floats]) -> bool:
 
 
 def write(path: str | Path, tracks: Tracks, step: float = 0.1) -> None:
-    """Write tracks as the table that `read` reads, their points `step` seconds apart.
+    """Write tracks as the table that `read` reads, their points `step` seconds apart; makes the folder.
 
     Raises InputError where there are no tracks."""
     if len(tracks.offsets) < 2:
         raise InputError(f"{path}: there are no tracks to write")
     heading = [] if tracks.heading is None else [tracks.heading]
     columns = np.column_stack([tracks.points, *heading])
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         rows = table.writer(file)
         rows.writerow([*REQUIRED, *["heading" for _ in heading]])

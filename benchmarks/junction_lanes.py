@@ -58,7 +58,7 @@ def lane_setting(engine: str, structure: Setting) -> LaneSetting:
 
     with initialize_config_module("configs", version_base="1.3"):
         config = compose("run", [f"engine={engine}"]).engine
-    knobs = {"num_steps": 12, "tolerance": 0.1, "learn": tuple(config.refine.learn), "num_draws": 1}
+    knobs = {"num_steps": 12, "tolerance": 1.0, "learn": tuple(config.refine.learn), "num_draws": 1}
     return LaneSetting(structure, instantiate(config.courses), knobs)
 
 

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.linalg.lapack import dpotri
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from inference.posterior import Posterior, Snapshots
 from models.capability import HasSquares, Squares
@@ -74,8 +74,8 @@ def minimise(
     for number in range(num_steps):
         hessian = state.hessian.copy()
         hessian.ravel()[:: len(x) + 1] *= 1.0 + damping
-        factor = cho_factor(hessian, lower=True, overwrite_a=True, check_finite=False)
-        move = -cho_solve(factor, state.gradient, check_finite=False)
+        factor, _ = dpotrf(hessian.T, lower=1, overwrite_a=1)  # the transpose of a symmetric matrix is what LAPACK reads
+        move = -dpotrs(factor, state.gradient, lower=1)[0]
         promise = float(-state.gradient @ move - 0.5 * move @ state.hessian @ move)
         converged = promise <= tolerance
         if converged and (not learn or number > LEARNT_AFTER[1]):
@@ -88,7 +88,7 @@ def minimise(
         else:
             damping, growth = damping * growth, 2.0 * growth
         if learn and number in LEARNT_AFTER:
-            state, scale = relearn(squares, state, scale, np.diag(dpotri(factor[0], lower=1)[0]), learn)
+            state, scale = relearn(squares, state, scale, np.diag(dpotri(factor, lower=1)[0]), learn)
         visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
     return Path(state, scale, visited, converged)
 

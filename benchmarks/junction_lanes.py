@@ -27,7 +27,9 @@ from experiments.scenarios.scene import Scene
 from inference import least_squares
 from inference.posterior import Posterior
 from inference.progress import Progress
-from models.intersection.courses import CourseEvidence, LaneCourses, centre_lines, lane_bands
+from models.intersection.course_evidence import CourseEvidence
+from models.intersection.course_lines import centre_lines, lane_bands
+from models.intersection.courses import LaneCourses
 from models.intersection.routes import RoutedTracks, Routes
 from models.program import InputError
 

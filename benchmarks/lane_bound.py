@@ -25,7 +25,9 @@ from experiments.lane_metrics import DROPPED
 from experiments.scenarios import paths
 from experiments.scenarios.interiors import STRETCH
 from experiments.scenarios.scene import JunctionTruth, join_tracks
-from models.intersection.courses import CourseEvidence, LaneCourses, lane_nodes, layout_of
+from models.intersection.course_evidence import CourseEvidence
+from models.intersection.course_lines import lane_nodes, layout_of
+from models.intersection.courses import LaneCourses
 from models.intersection.routes import RoutedTracks, Routes
 
 Floats = NDArray[np.float64]

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from experiments.lanelet_osm import write_osm
 from experiments.lanelets import lanelet_map
 from inference.posterior import Posterior
-from models.intersection.courses import CourseEvidence, LaneCourses, centre_lines, lane_bands
+from models.intersection.course_evidence import CourseEvidence
+from models.intersection.course_lines import centre_lines, lane_bands
+from models.intersection.courses import LaneCourses
 from models.intersection.evidence import JunctionEvidence
 from models.intersection.routes import RoutedTracks, Routes, find_routes
 from models.intersection.same_lane import merge_routes

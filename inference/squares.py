@@ -74,7 +74,7 @@ def minimise(
     for number in range(num_steps):
         hessian = state.hessian.copy()
         hessian.ravel()[:: len(x) + 1] *= 1.0 + damping
-        factor, _ = dpotrf(hessian.T, lower=1, overwrite_a=1)  # the transpose of a symmetric matrix is what LAPACK reads
+        factor, _ = dpotrf(hessian.T, lower=1, overwrite_a=1)  # LAPACK reads the transpose, which is the same
         move = -dpotrs(factor, state.gradient, lower=1)[0]
         promise = float(-state.gradient @ move - 0.5 * move @ state.hessian @ move)
         converged = promise <= tolerance

@@ -14,7 +14,7 @@ from experiments.scenarios import paths
 from experiments.scenarios.interiors import bezier
 from experiments.scenarios.protocol import ARM_LENGTH, _ends, _stub, protocol
 from experiments.scenarios.scene import JunctionTruth
-from models.intersection.courses import lane_nodes
+from models.intersection.course_lines import lane_nodes
 
 
 @pytest.fixture(scope="module")

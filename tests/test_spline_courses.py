@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 from benchmarks.lane_papers import m20_refine
 from experiments.scenarios.protocol import protocol
 from inference.squares import minimise
-from models.intersection.courses import LaneCourses, course_evidence
+from models.intersection.course_evidence import course_evidence
 from models.intersection.routes import Routes
 from models.intersection.spline_courses import SplineCourses, SplineEvidence, centre_lines, first_lines, stages
 from models.program import InputError, check, log_joint, simulate
@@ -141,7 +141,7 @@ def test_neighbours_add_to_the_cost_of_the_program() -> None:
 
 
 def test_first_courses_are_the_lanes_of_the_arms_joined_by_straight_lines() -> None:
-    for corners, true in zip(first_lines(course_evidence(ROUTED, LaneCourses())), SCENE.truth.lines, strict=True):
+    for corners, true in zip(first_lines(course_evidence(ROUTED, 1.0)), SCENE.truth.lines, strict=True):
         apart = np.linalg.norm(corners[1:3, None] - true, axis=-1).min(1)
         assert apart.max() < 0.15  # true lines have a point every 0.25 m
         for a, b, end in ((corners[0], corners[1], true[:2]), (corners[2], corners[3], true[-2:])):
@@ -151,7 +151,7 @@ def test_first_courses_are_the_lanes_of_the_arms_joined_by_straight_lines() -> N
 
 def test_first_splines_follow_the_first_courses() -> None:
     """A spline with a control above each 5 m cuts the corners and is straight elsewhere."""
-    lines = first_lines(course_evidence(ROUTED, LaneCourses()))
+    lines = first_lines(course_evidence(ROUTED, 1.0))
     for line, corners in zip(centre_lines(EVIDENCE, {}), lines, strict=True):
         off_corners = np.linalg.norm(line[:, None] - corners[1:3], axis=-1).min(1) > 15.0
         assert off_corners.sum() > 40

@@ -19,10 +19,9 @@ fits one B-spline to every lane and ties neighbours on an arm together by their 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyro
@@ -34,48 +33,14 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from models.capability import Squares
-from models.intersection.borders import BEYOND, FARTHEST, interior_radius
-from models.intersection.course_kernel import centre_line, normal_equations
-from models.intersection.course_nodes import ARM_WAVE, END, HEAD, INNER_WAVE, LOCAL, RIPPLED, WAVY
+from models.intersection.course_evidence import CourseEvidence, course_evidence
+from models.intersection.course_kernel import normal_equations
+from models.intersection.course_lines import SITES, Layout, needed
 from models.intersection.routes import RoutedTracks
 from models.program import InputError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-ARM_SITES = ("angle", "gap", "width", "bend", "shift", "onset")
-PLAIN = ("centre", "lane_width", *ARM_SITES, "offset", "advance", "handle")
-SITES = (*PLAIN, "inner_wave", "arm_wave", "lane_wave")
-WIDTHS = {len(PLAIN): LOCAL, len(PLAIN) + 1: RIPPLED, len(SITES): WAVY}  # numbers of a lane, by how many sites
-
-
-class CourseEvidence(NamedTuple):
-    """Points of all tracks on routes, and what the structure says about the lanes.
-
-    points       (3, N) x, y about the origin [m], heading [rad]
-    offsets      (T + 1,) of the tracks
-    tracks       indices of tracks, lane by lane; starts (L + 1,)
-    connections  (L, 4) as in Routes
-    stubs        (L, 2) which of the S driven lanes of arms each lane begins and ends on
-    loc          {site: value}, the middle of each prior
-    reach        (L, 2) distance from the centre to which each lane was driven on either arm [m]
-    counts       (L, 3) nodes on the entry arm, pieces of the interior, nodes on the exit arm
-    origin       (2,) [m]
-    heading      whether headings were measured
-    first        {site: value} where the structure itself is another than loc
-    """
-
-    points: Tensor
-    offsets: Ints
-    tracks: Ints
-    starts: Ints
-    connections: Ints
-    stubs: Ints
-    loc: dict[str, Array]
-    reach: Array
-    counts: Ints
-    origin: Array
-    heading: bool
-    first: dict[str, Array]
 
 
 @dataclass(frozen=True)
@@ -100,6 +65,13 @@ class LaneCourses:
     heading_std: float = 0.1  # of a measured heading [rad]
     spacing: float = 1.0  # of the nodes [m]
 
+    def __post_init__(self) -> None:
+        for name in (*(f"{site}_std" for site in SITES), "position_std", "heading_std", "spacing"):
+            value, may_be_zero = getattr(self, name), name.removesuffix("_std") in SITES
+            if not math.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
+                least = "zero or positive" if may_be_zero else "positive"
+                raise InputError(f"{name} must be finite and {least}, but is {value}")
+
     def __call__(self, evidence: CourseEvidence) -> None:
         latents = {}
         for name in SITES:
@@ -114,7 +86,7 @@ class LaneCourses:
 
     def prepare(self, routed: RoutedTracks) -> CourseEvidence:
         """Evidence of this model. Raises InputError where no track is on a route."""
-        return course_evidence(routed, self)
+        return course_evidence(routed, self.spacing)
 
     def start(self, evidence: CourseEvidence) -> dict[str, Array]:
         """A first state: widths and bends of the structure as far as the prior likes them, all else at its middle."""
@@ -131,55 +103,14 @@ class LaneCourses:
                 end = sites[name].stop
         scale = [np.full(part.stop - part.start, getattr(self, f"{name}_std")) for name, part in sites.items()]
         loc = np.concatenate([evidence.loc[name].reshape(-1) for name in sites])
-        held = {name: value for name, value in evidence.loc.items() if name not in sites}
         whole = Layout(evidence, self.sites)
         index = np.concatenate([np.arange(whole.sites[name].start, whole.sites[name].stop) for name in sites])
-        base = whole.pack(held | evidence.loc)
+        base = whole.pack(evidence.loc)
         data = evidence_arrays(self, evidence)
         slots = np.full(whole.size, -1)
         slots[index] = np.arange(len(index))
         evaluate = partial(_evaluate, base, index, (whole.where, slots[whole.where], *data))
         return Squares(loc, np.concatenate(scale), sites, shapes, evaluate, log_constant(self, evidence))
-
-
-def needed(latent: Iterable[str]) -> tuple[str, ...]:
-    """The sites that lanes are computed from where these are latent: the first ones, in blocks."""
-    last = max((SITES.index(name) for name in latent), default=0)
-    return SITES[: next(num for num in WIDTHS if num > last)]
-
-
-class Layout:
-    """Sites in one vector of numbers, constants included, and the part of it that each lane depends on."""
-
-    def __init__(self, evidence: CourseEvidence, sites: tuple[str, ...]) -> None:
-        sizes = [evidence.loc[name].size for name in sites]
-        ends = np.cumsum([0, *sizes])
-        self.size = int(ends[-1])
-        self.sites = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(sites)}
-        num = len(evidence.connections)
-        self.where = np.zeros((num, WIDTHS[len(sites)]), np.int64)
-        self.where[:, 1], self.where[:, 2] = 1, self.sites["lane_width"].start
-        for end in range(2):
-            first, arm = HEAD + END * end, evidence.connections[:, 2 * end]
-            for field, name in enumerate(ARM_SITES):
-                self.where[:, first + field] = self.sites[name].start + arm
-            own = [self.sites["offset"].start + evidence.stubs[:, end]]
-            own += [self.sites[name].start + 2 * np.arange(num) + end for name in ("advance", "handle")]
-            self.where[:, first + len(ARM_SITES) : first + END] = np.stack(own, 1)
-            if "arm_wave" in sites:
-                first = RIPPLED + 2 * ARM_WAVE * end
-                self.where[:, first : first + ARM_WAVE] = self._rows("arm_wave", arm, ARM_WAVE)
-                first += ARM_WAVE
-                self.where[:, first : first + ARM_WAVE] = self._rows("lane_wave", evidence.stubs[:, end], ARM_WAVE)
-        if "inner_wave" in sites:
-            self.where[:, LOCAL:RIPPLED] = self._rows("inner_wave", np.arange(num), INNER_WAVE)
-
-    def _rows(self, name: str, rows: Ints, width: int) -> Ints:
-        return np.asarray(self.sites[name].start + width * rows[:, None] + np.arange(width))
-
-    def pack(self, latents: Mapping[str, Any]) -> Array:
-        """{site: (*event)} to (D,)."""
-        return np.concatenate([np.asarray(latents[name], dtype=np.float64).reshape(-1) for name in self.sites])
 
 
 def evidence_arrays(model: LaneCourses, evidence: CourseEvidence) -> tuple[Any, ...]:
@@ -235,116 +166,3 @@ class PointsOnCourses(TorchDistribution):
         rest = (self.layout.where, np.full_like(self.layout.where, -1), *data, hessian, gradient)
         costs = [normal_equations(z, *rest) for z in rows]  # type: ignore[call-arg]
         return constant - torch.tensor(costs, dtype=torch.float64).reshape(self.batch_shape)
-
-
-def course_evidence(routed: RoutedTracks, model: LaneCourses) -> CourseEvidence:
-    """Points about the estimated centre, sorted into lanes, with the priors' middles from the structure.
-
-    Raises InputError where no track is on a route."""
-    tracks, structure, (connections, track_route) = routed
-    on_route = np.flatnonzero(track_route >= 0)
-    if len(on_route) == 0:
-        raise InputError("no track has both an entry and an exit lane; give tracks that cross the junction")
-    order = on_route[np.argsort(track_route[on_route], kind="stable")]
-    starts = np.searchsorted(track_route[order], np.arange(len(connections) + 1))
-    origin = np.asarray(structure["centre"], dtype=np.float64)
-    heading = np.zeros(len(tracks.points)) if tracks.heading is None else tracks.heading
-    points = np.vstack([(tracks.points - origin).T, heading])
-    ends = np.stack([connections[:, :2], connections[:, 2:]], 1)  # (L, 2, 2)
-    keys = np.concatenate([np.insert(ends[:, e], 0, e, axis=1) for e in range(2)])
-    stubs = np.unique(keys, axis=0, return_inverse=True)[1].reshape(2, -1).T
-    loc = prior_middles(structure, connections, int(stubs.max()) + 1)
-    reach = farthest(points, tracks.offsets, order, track_route, connections, loc["angle"])
-    counts = node_counts(loc, connections, reach, model.spacing)
-    table = (tracks.offsets.astype(np.int64), order, starts, connections.astype(np.int64), stubs.astype(np.int64))
-    arms = slice(int(structure["num_arms"]))
-    first = {"width": np.asarray(structure["width"], dtype=np.float64)[arms] - loc["lane_width"]}
-    if "bend" in structure:
-        first["bend"] = np.asarray(structure["bend"], dtype=np.float64)[arms]
-    measured = tracks.heading is not None
-    return CourseEvidence(torch.from_numpy(points), *table, loc, reach, counts, origin, measured, first)
-
-
-def prior_middles(structure: Mapping[str, Any], connections: Ints, num_stubs: int) -> dict[str, Array]:
-    """The middle of every prior: the structure's estimate; interiors begin where borders meet."""
-    num = int(structure["num_arms"])
-    field = lambda name: np.asarray(structure[name], dtype=np.float64)[:num]  # noqa: E731
-    loc = {"centre": np.zeros(2), "angle": field("angle"), "gap": field("gap")}
-    width = field("width")
-    loc["lane_width"], loc["width"] = np.asarray(width.mean()), np.zeros(num)
-    loc["bend"], loc["shift"] = np.zeros(num), field("shift") if "shift" in structure else np.zeros(num)
-    left = loc["gap"] / 2 + field("entries") * width
-    right = loc["gap"] / 2 + field("exits") * width
-    loc["onset"] = interior_radius(loc["angle"], left, right)
-    loc["offset"], loc["advance"] = np.zeros(num_stubs), np.zeros((len(connections), 2))
-    loc["handle"] = np.ones((len(connections), 2))
-    loc["arm_wave"], loc["lane_wave"] = np.zeros((num, ARM_WAVE)), np.zeros((num_stubs, ARM_WAVE))
-    loc["inner_wave"] = np.zeros((len(connections), INNER_WAVE))
-    return loc
-
-
-def farthest(points: Array, offsets: Ints, order: Ints, track_route: Ints, connections: Ints, angle: Array) -> Array:
-    """How far out on its entry and its exit arm each lane was driven, (L, 2) [m]."""
-    reach = np.zeros((len(connections), 2))
-    for end in range(2):
-        outermost = offsets[order] if end == 0 else offsets[order + 1] - 1
-        arm = angle[connections[track_route[order], 2 * end]]
-        along = points[0, outermost] * np.cos(arm) + points[1, outermost] * np.sin(arm)
-        np.maximum.at(reach[:, end], track_route[order], along)
-    return np.maximum(reach, FARTHEST + 2 * BEYOND)
-
-
-def node_counts(loc: dict[str, Array], connections: Ints, reach: Array, spacing: float) -> Ints:
-    """Nodes of each lane, about `spacing` apart; fixed, so that the density does not jump."""
-    onset = loc["onset"][connections[:, ::2]]
-    arms = np.maximum(np.ceil((reach - onset) / spacing), 2)
-    a, b = loc["angle"][connections[:, 0]], loc["angle"][connections[:, 2]]
-    chord = np.hypot(
-        onset[:, 1] * np.cos(b) - onset[:, 0] * np.cos(a), onset[:, 1] * np.sin(b) - onset[:, 0] * np.sin(a)
-    )
-    inside = np.maximum(np.ceil(1.2 * np.maximum(chord, 5.0) / spacing), 4)
-    return np.stack([arms[:, 0], inside, arms[:, 1]], 1).astype(np.int64)
-
-
-def centre_lines(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[Array]:
-    """Centre lines of all lanes in driving order, L arrays (n, 2), for one state {site: (*event)}."""
-    return [nodes[:, :2] + evidence.origin for nodes in lane_nodes(evidence, latents)]
-
-
-def layout_of(evidence: CourseEvidence, latents: Mapping[str, Any]) -> Layout:
-    """The layout of a state, with the waves it has."""
-    return Layout(evidence, needed(name for name in SITES if name in latents))
-
-
-def lane_nodes(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[Array]:
-    """Nodes of all lanes, see `course_nodes`."""
-    layout = layout_of(evidence, latents)
-    z = layout.pack(evidence.loc | dict(latents))
-    lanes, out = np.ascontiguousarray(evidence.connections[:, 1::2]), []
-    for lane, counts in enumerate(evidence.counts):
-        nodes = np.empty((counts.sum() + 1, 5 + layout.where.shape[1]))
-        centre_line(z[layout.where[lane]], lanes[lane], evidence.reach[lane], counts, nodes)
-        out.append(nodes)
-    return out
-
-
-def lane_bands(
-    evidence: CourseEvidence, estimate: Mapping[str, Any], draws: Mapping[str, Array], level: float
-) -> tuple[list[Array], list[Array]]:
-    """How far left and right of the estimate's centre lines the draws' lines lie, L arrays (n,) each [m].
-
-    draws  {site: (D, *event)}, equally weighted; displacements are linear in what separates a draw from the
-    estimate. Between the two edges lies the share `level` of the draws at each point, half of the rest on either
-    side."""
-    layout = layout_of(evidence, estimate)
-    here = layout.pack(evidence.loc | dict(estimate))
-    num = len(next(iter(draws.values())))
-    there = [draws.get(n, np.broadcast_to(evidence.loc[n], (num, *evidence.loc[n].shape))) for n in layout.sites]
-    apart = np.concatenate([values.reshape(num, -1) for values in there], 1) - here
-    left, right = [], []
-    for nodes, index in zip(lane_nodes(evidence, estimate), layout.where, strict=True):
-        across = nodes[:, 5:] @ apart[:, index].T  # (n, D)
-        low, high = np.quantile(across, [0.5 - level / 2, 0.5 + level / 2], axis=1)
-        left.append(high)
-        right.append(-low)
-    return left, right

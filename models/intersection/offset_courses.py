@@ -27,7 +27,7 @@ from torch import Tensor
 
 from models.capability import Kernel, Move, Proposal
 from models.intersection import offset_kernel
-from models.intersection.courses import LaneCourses, course_evidence
+from models.intersection.course_evidence import course_evidence
 from models.intersection.kernel import compiled
 from models.intersection.offset_kernel import MOMENTS, NUM_UNIFORMS, STATION
 from models.intersection.routes import RoutedTracks
@@ -135,7 +135,7 @@ def offset_evidence(routed: RoutedTracks, num: int) -> OffsetEvidence:
     """Stations along the first courses and the points beside them.
 
     Raises InputError where no track is on a route."""
-    courses = course_evidence(routed, LaneCourses())
+    courses = course_evidence(routed, 1.0)  # nodes a metre apart
     lines = first_lines(courses)
     stations, segments = np.empty((len(lines), num, STATION)), np.empty((len(lines), num - 1, MOMENTS))
     for lane, (line, tracks) in enumerate(zip(lines, tracks_by_lane(courses), strict=True)):

@@ -10,8 +10,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from models.intersection.course_evidence import CourseEvidence
 from models.intersection.course_kernel import sum_points
-from models.intersection.courses import CourseEvidence, lane_nodes
+from models.intersection.course_lines import lane_nodes
 from models.intersection.routes import Routes
 
 Ints = NDArray[np.int64]

@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from models.capability import Squares
-from models.intersection.courses import CourseEvidence, LaneCourses, course_evidence, lane_nodes
+from models.intersection.course_evidence import CourseEvidence, course_evidence
+from models.intersection.course_lines import lane_nodes
 from models.intersection.routes import RoutedTracks
 from models.intersection.spline_kernel import add_neighbours, add_points
 from models.spline import ORDER, basis, evaluate
@@ -161,7 +162,7 @@ def spline_evidence(routed: RoutedTracks, model: SplineCourses) -> SplineEvidenc
     """Points in the frames of their lanes, and which lanes are neighbours where.
 
     Raises InputError where no track is on a route."""
-    courses = course_evidence(routed, LaneCourses())
+    courses = course_evidence(routed, 1.0)  # nodes a metre apart
     lines, num = first_lines(courses), model.num_controls
     frames, first, y, controls_at, weights = np.empty((len(lines), 4)), np.empty((len(lines), num)), [], [], []
     for lane, tracks in enumerate(tracks_by_lane(courses)):

@@ -17,7 +17,6 @@ The reference is the model's exact posterior where it has one, else that of the 
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import sys
 from collections.abc import Callable
@@ -281,10 +280,10 @@ def print_table(records: list[dict[str, Any]], caption: str) -> None:
 
 def write(folder: Path, records: list[dict[str, Any]], rows: list[Row], caption: str) -> None:
     """compare.csv, compare.json and a self-contained report.html in a folder of their own."""
-    from experiments.report import details, page, split_unit, table
+    from experiments.report import details, head, page, table
 
     names = _columns(records)
-    heads = tuple(f"{label} [{unit}]" if unit else label for label, unit in map(split_unit, names))
+    heads = tuple(map(head, names))
     failed = [(record["engine"], record["error"]) for record in records if record["error"]]
     runs = {row.engine: [cell.folder.name for cell in row.cells] for row in rows}
     body = [f"<h1>{folder.name}</h1><p class='sub'>mean ± sd over seeds; {caption}</p>"]
@@ -294,10 +293,7 @@ def write(folder: Path, records: list[dict[str, Any]], rows: list[Row], caption:
     body += [details("runs", runs)]
     with store.writing(folder) as temporary:
         store.write_json(temporary / "compare.json", {"records": records, "runs": runs})
-        with (temporary / "compare.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(dict.fromkeys(name for record in records for name in record)))
-            writer.writeheader()
-            writer.writerows(records)
+        store.write_rows(temporary / "compare.csv", records)
         (temporary / "report.html").write_text(page(folder.name, "".join(body)))
 
 

@@ -92,6 +92,25 @@ def driven_arms(truth: JunctionTruth) -> NDArray[np.bool_]:
     return np.ones(len(truth.angle), dtype=bool) if truth.driven is None else truth.driven
 
 
+ARM_COLUMNS = {"angle": "direction_deg", "entries": "entries", "exits": "exits", "width": "width_m", "gap": "gap_m"}
+
+
+def arms(estimate: Estimate) -> list[dict[str, float]]:
+    """The arms of an estimate, a row each, counter-clockwise from west; nothing where it is none of a junction.
+
+    direction_deg   in which the arm leaves the centre, from the x axis counter-clockwise, -180 to 180
+    entries, exits  lanes towards and away from the centre
+    width_m         of a lane, where the model estimates it
+    gap_m           between the innermost entry and exit, where the model estimates it
+    """
+    if not {"num_arms", "angle", "entries", "exits"} <= estimate.keys():
+        return []
+    active = {site: np.asarray(estimate[site])[: int(estimate["num_arms"])] for site in ARM_COLUMNS if site in estimate}
+    active["angle"] = np.degrees(wrap(active["angle"]))
+    order = np.argsort(active["angle"])
+    return [{ARM_COLUMNS[site]: round(values[i].item(), 3) for site, values in active.items()} for i in order]
+
+
 def label_free(posterior: Posterior) -> dict[str, NDArray[np.float64]]:
     """What no relabelling of arms changes, {name: (chain, draw)}: lanes in all and the centre [m]."""
     draws = posterior.draws

@@ -40,19 +40,26 @@ def write_report(
     folder: Path,
     title: str,
     result: Result,
+    arms: list[dict[str, float]],
     images: dict[str, str],
     failures: dict[str, Exception],
     manifest: dict[str, Any],
 ) -> None:
-    """Write report.html, which embeds its images (save_figures) and needs nothing else."""
+    """Write report.html, which embeds its images (save_figures) and needs nothing else.
+
+    arms  of the estimate, where it is a junction (junction_metrics.arms)"""
     info = result.posterior.info
+    unscored = "<p>none: the truth of this scene is unknown</p>" if result.scene.truth is None else "<p>none</p>"
     body = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="sub">scene {escape(result.scene.name)} &middot; {escape(manifest["date"])}</p>',
         _failures(failures),
         _flags(result.flags),
+        f"<h2>Arms found</h2>{table(tuple(map(head, arms[0])), [tuple(a.values()) for a in arms])}" if arms else "",
         "<h2>Scores</h2>",
-        table(("metric", "value", "unit"), [(label, v, unit) for (label, unit), v in _labelled(result.scores)]),
+        table(("metric", "value", "unit"), [(label, v, unit) for (label, unit), v in _labelled(result.scores)])
+        if result.scores
+        else unscored,
         "".join(f"<h2>{escape(name)}</h2>{image}" for name, image in images.items()),
         "<h2>Convergence</h2>",
         _by_name(result.diagnostics),
@@ -102,6 +109,12 @@ def split_unit(name: str) -> tuple[str, str]:
     """A readable label and the unit that stands at the end of a metric's name."""
     head, _, tail = name.rpartition("_")
     return (head.replace("_", " "), UNITS[tail]) if head and tail in UNITS else (name.replace("_", " "), "")
+
+
+def head(name: str) -> str:
+    """The heading of a column by its name: 'width_m' -> 'width [m]'."""
+    label, unit = split_unit(name)
+    return f"{label} [{unit}]" if unit else label
 
 
 def number(value: Any) -> str:

@@ -206,6 +206,7 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
 
 def write(job: Job, result: Result) -> dict[str, Exception]:
     """Store a result in the folder of its job; all failures, those of writing figures and report included."""
+    from experiments.junction_metrics import arms
     from experiments.report import save_figures, write_report
 
     seeds = {"run": job.config["seed"], "engine": engine_seed(job.config["seed"])}
@@ -217,7 +218,10 @@ def write(job: Job, result: Result) -> dict[str, Exception]:
         images, unsaved = save_figures(folder, result.figures)
         failures = result.failures | unsaved
         try:
-            write_report(folder, job.name, result, images, failures, manifest)
+            found = arms(result.posterior.estimate)
+            if found:
+                store.write_rows(folder / "arms.csv", found)
+            write_report(folder, job.name, result, found, images, failures, manifest)
         except Exception as error:
             failures["report"] = error
         store.write_json(folder / "manifest.json", manifest | {"failures": in_short(failures)})
@@ -225,7 +229,7 @@ def write(job: Job, result: Result) -> dict[str, Exception]:
 
 
 def show(folder: Path) -> None:
-    """Print the scores of a stored run, what speaks against its draws, and where the report is."""
+    """Print the arms and scores of a stored run, what speaks against its draws, and where the report is."""
     from rich.console import Console
     from rich.table import Table
 
@@ -237,6 +241,13 @@ def show(folder: Path) -> None:
         label, unit = split_unit(name)
         table.add_row(label, number(value), unit)
     console = Console()
+    if (folder / "arms.csv").exists():
+        arms = store.read_rows(folder / "arms.csv")
+        columns = [f"{label}\n[dim]{unit}[/]" if unit else label for label, unit in map(split_unit, arms[0])]
+        found = Table(*columns, title="arms found", title_justify="left")
+        for arm in arms:
+            found.add_row(*(number(float(value)) for value in arm.values()))
+        console.print(found)
     if scores:
         console.print(table)
     flags = store.read_json(folder / "diagnostics.json")["flags"]

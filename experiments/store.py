@@ -2,6 +2,7 @@
 
     runs/<scenario>-<model>-<engine>-<identity>/
         manifest.json  scores.json  diagnostics.json  posterior.npz  posterior.json
+        arms.csv       where the estimate is a junction
         figures/*.png  report.html
 
 The identity is a hash of the resolved config, of the source code and of the input files: a run that
@@ -10,6 +11,7 @@ is done under the same identity need not run again.
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import importlib.metadata
 import json
@@ -163,6 +165,20 @@ def write_json(file: Path, content: Any) -> None:
 def read_json(file: Path) -> Any:
     """What write_json wrote."""
     return json.loads(file.read_text())
+
+
+def write_rows(file: Path, rows: list[dict[str, Any]]) -> None:
+    """A CSV table of dictionaries; its columns are all their keys."""
+    with file.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(dict.fromkeys(name for row in rows for name in row)))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read_rows(file: Path) -> list[dict[str, str]]:
+    """What write_rows wrote, as text."""
+    with file.open(newline="") as stream:
+        return list(csv.DictReader(stream))
 
 
 def _jsonable(value: Any) -> Any:

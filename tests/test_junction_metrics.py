@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from experiments.junction_figures import figures
 from experiments.junction_lanes import count_probabilities
 from experiments.junction_lanes import figures as lane_figures
-from experiments.junction_metrics import label_free, match, metrics, structure
+from experiments.junction_metrics import arms, label_free, match, metrics, structure
+from experiments.scenarios import paths
 from experiments.scenarios.protocol import protocol
 from experiments.scenarios.scene import JunctionTruth, Scene
 from inference.posterior import Posterior, Snapshots
@@ -46,6 +47,21 @@ def test_the_truth_itself_scores_without_error(scene: Scene) -> None:
     score = structure(perfect(scene.truth), scene.truth)
     assert score["arms_right"] == score["structure_right"] == score["lanes_right"] == 1.0
     assert score["angle_error_deg"] == score["centre_error_m"] == score["gap_error_m"] == 0.0
+
+
+def test_arms_are_listed_in_degrees_without_inactive_slots(scene: Scene) -> None:
+    rows = arms(perfect(scene.truth))
+    order = np.argsort(paths.wrap(scene.truth.angle))
+    assert len(rows) == len(scene.truth.angle) < SLOTS
+    directions = np.degrees(paths.wrap(scene.truth.angle))[order]
+    np.testing.assert_allclose([row["direction_deg"] for row in rows], directions, atol=1e-3)
+    assert [row["entries"] for row in rows] == scene.truth.entries[order].tolist()
+    assert [row["exits"] for row in rows] == scene.truth.exits[order].tolist()
+    assert {"width_m", "gap_m"} <= rows[0].keys()
+
+
+def test_an_estimate_of_something_else_has_no_arms() -> None:
+    assert arms({"beta": np.zeros(2)}) == []
 
 
 def test_the_order_of_slots_and_whole_turns_change_no_score(scene: Scene) -> None:

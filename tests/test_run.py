@@ -11,6 +11,8 @@ import pytest
 from experiments import store
 from experiments.metrics import site_error
 from experiments.run import engine_seed, run, show
+from experiments.scenarios import csv_tracks
+from experiments.scenarios.protocol import protocol
 from experiments.scenarios.toys import line, slot_road
 from inference.posterior import Posterior
 from models.intersection.state import Junction
@@ -47,6 +49,19 @@ def test_a_run_leaves_a_complete_folder_and_an_identical_one_is_skipped(launch: 
     assert third.returncode == 0, third.stderr
     assert len(Path("calls.txt").read_text().split()) == 2
     assert [path.name for path in Path("runs").iterdir()] == [folder.name]
+
+
+def test_the_arms_of_tracks_without_truth_are_told(launch: Command) -> None:
+    csv_tracks.write("tracks.csv", protocol(0).data)
+    words = ["engine.num_steps=200", "engine.warmup=100", "engine.thin=1", "engine.polish=false"]
+    done = launch("experiment=my_tracks", "scenario.path=tracks.csv", *words)
+    assert done.returncode == 0, done.stderr
+    assert "arms found" in done.stdout and "direction" in done.stdout
+    (folder,) = Path("runs").iterdir()
+    rows = store.read_rows(folder / "arms.csv")
+    assert len(rows) >= 2 and -180 <= float(rows[0]["direction_deg"]) <= 180
+    report = (folder / "report.html").read_text()
+    assert "Arms found" in report and "none: the truth of this scene is unknown" in report
 
 
 @pytest.mark.parametrize(("num", "words"), [(4, "and 1 more flag in"), (5, "and 2 more flags in")])

@@ -49,9 +49,11 @@ class Path(NamedTuple):
     converged: bool
 
 
-def linearise(squares: Squares, scale: Array, x: Array) -> State:
-    """The state at x. Raises FloatingPointError where the cost is not finite."""
-    gradient, hessian = np.empty(len(x)), np.empty((len(x), len(x)))
+def linearise(squares: Squares, scale: Array, x: Array, hessian: Array) -> State:
+    """The state at x, its Hessian in `hessian`: matrices made anew cost as much as what they are filled with.
+
+    Raises FloatingPointError where the cost is not finite."""
+    gradient = np.empty(len(x))
     cost = squares.evaluate(squares.loc + scale * x, hessian, gradient)
     if not np.isfinite(cost):
         raise FloatingPointError(f"the sum of squares is {cost} at {squares.unpack(squares.loc + scale * x)}")
@@ -69,26 +71,30 @@ def minimise(
     if unknown:
         raise InputError(f"learn names {', '.join(unknown)}, but the latents are {', '.join(squares.sites)}")
     began, scale, growth, converged = time.perf_counter(), squares.scale, 2.0, False
-    state = linearise(squares, scale, x)
+    own, spare, damped = (np.empty((len(x), len(x))) for _ in range(3))
+    state = linearise(squares, scale, x, own)
     visited = [(time.perf_counter() - began, state.cost, squares.loc + scale * x)]
     for number in range(num_steps):
-        hessian = state.hessian.copy()
-        hessian.ravel()[:: len(x) + 1] *= 1.0 + damping
-        factor, _ = dpotrf(hessian.T, lower=1, overwrite_a=1)  # LAPACK reads the transpose, which is the same
+        damped[:] = state.hessian
+        damped.ravel()[:: len(x) + 1] *= 1.0 + damping
+        factor, failed = dpotrf(damped.T, lower=1, overwrite_a=1)  # LAPACK reads the transpose, which is the same
+        if failed:
+            raise FloatingPointError(f"the Hessian has no Cholesky factor (dpotrf says {failed}): it is not finite")
         move = -dpotrs(factor, state.gradient, lower=1)[0]
         promise = float(-state.gradient @ move - 0.5 * move @ state.hessian @ move)
         converged = promise <= tolerance
         if converged and (not learn or number > LEARNT_AFTER[1]):
             break
-        new = linearise(squares, scale, state.x + move)
+        new = linearise(squares, scale, state.x + move, spare)
         gain = state.cost - new.cost
         if gain > 0:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / max(promise, 1e-12) - 1.0) ** 3)
-            state, growth = new, 2.0
+            state, spare, growth = new, state.hessian, 2.0
         else:
             damping, growth = damping * growth, 2.0 * growth
         if learn and number in LEARNT_AFTER:
-            state, scale = relearn(squares, state, scale, np.diag(dpotri(factor, lower=1)[0]), learn)
+            variance = np.diag(dpotri(factor, lower=1, overwrite_c=1)[0])  # of the step's start: near enough
+            state, scale = relearn(squares, state, scale, variance, learn)
         visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
     return Path(state, scale, visited, converged)
 
@@ -96,7 +102,9 @@ def minimise(
 def relearn(
     squares: Squares, state: State, scale: Array, variance: Array, learn: tuple[str, ...]
 ) -> tuple[State, Array]:
-    """The same latents under learnt prior scales: (state, scale (D,)); variance (D,) of x in the posterior."""
+    """The same latents under learnt prior scales: (state, scale (D,)); variance (D,) of x in the posterior.
+
+    The Hessian is changed where it is."""
     new = scale.copy()
     for name in learn:
         part = squares.sites[name]
@@ -107,9 +115,12 @@ def relearn(
         new[part] = configured * np.clip(ratio, 1.0 / 5.0, WIDEST)
     factor = new / scale
     x = state.x / factor
-    flat = state.gradient - state.x  # of the data alone
-    hessian = state.hessian - np.eye(len(x))
-    hessian = factor[:, None] * hessian * factor + np.eye(len(x))
+    flat, hessian = state.gradient - state.x, state.hessian  # flat: of the data alone
+    diagonal = hessian.ravel()[:: len(x) + 1]
+    diagonal -= 1.0
+    hessian *= factor
+    hessian *= factor[:, None]
+    diagonal += 1.0
     cost = state.cost - 0.5 * float(state.x @ state.x) + 0.5 * float(x @ x)
     return State(x, cost, x + factor * flat, hessian), new
 

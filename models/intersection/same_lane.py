@@ -29,15 +29,22 @@ def lateral_sums(points, offsets, tracks, nodes):  # type: ignore[no-untyped-def
     return sums
 
 
-def stretch_distance(one: NDArray[np.float64], other: NDArray[np.float64], nodes: int) -> float:
-    """Largest mean distance over stretches of `nodes` nodes that both have points in; inf where there is none."""
-    running = [np.concatenate([np.zeros((2, 1)), np.cumsum(sums[:2], axis=1)], 1) for sums in (one, other)]
-    span = min(nodes, one.shape[1])
-    (n1, y1), (n2, y2) = (r[:, span:] - r[:, :-span] for r in running)
-    both = np.minimum(n1, n2) >= 0.5 * span
-    if not both.any():
-        return float("inf")
-    return float(np.abs(y1[both] / n1[both] - y2[both] / n2[both]).max())
+@nb.njit(cache=True, error_model="numpy")
+def stretch_distance(one, other, span):  # type: ignore[no-untyped-def]
+    """Largest mean distance over stretches of `span` nodes where either has points at half of them; inf without any."""
+    num, most = one.shape[1], -1.0
+    span = min(span, num)
+    window = np.zeros((2, 2))  # points and summed distances of either in the stretch that ends at node i
+    for i in range(num):
+        for row in range(2):
+            window[0, row] += one[row, i]
+            window[1, row] += other[row, i]
+            if i >= span:
+                window[0, row] -= one[row, i - span]
+                window[1, row] -= other[row, i - span]
+        if i >= span - 1 and min(window[0, 0], window[1, 0]) >= 0.5 * span:
+            most = max(most, abs(window[0, 1] / window[0, 0] - window[1, 1] / window[1, 0]))
+    return most if most >= 0.0 else np.inf
 
 
 def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float) -> Routes:
@@ -48,7 +55,7 @@ def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float) -> Ro
     near &= (connections[:, None, ::2] == connections[None, :, ::2]).all(-1)
     if near.sum() == len(connections):  # every lane by itself
         return routes
-    becomes, courses = np.arange(len(connections)), lane_nodes(evidence, {})
+    becomes, span, courses = np.arange(len(connections)), round(WINDOW / spacing), lane_nodes(evidence, {})
     of_lane = [evidence.tracks[a:b] for a, b in zip(evidence.starts[:-1], evidence.starts[1:], strict=True)]
     for i in np.argsort(-size, kind="stable"):
         own = None
@@ -57,7 +64,7 @@ def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float) -> Ro
                 continue
             own = lateral_sums(points, evidence.offsets, of_lane[i], courses[i]) if own is None else own
             theirs = lateral_sums(points, evidence.offsets, of_lane[j], courses[i])
-            if stretch_distance(own, theirs, round(WINDOW / spacing)) < SAME:
+            if stretch_distance(own, theirs, span) < SAME:
                 becomes[j] = i
     kept = np.flatnonzero(becomes == np.arange(len(becomes)))
     number = np.searchsorted(kept, becomes)

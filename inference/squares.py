@@ -28,6 +28,7 @@ from models.program import InputError
 Array = NDArray[np.float64]
 TRUST = 4.0  # numbers that the configured scale counts for
 WIDEST = 20.0  # learnt scales stay within a fifth and this multiple of the configured ones
+STALL = 1.0  # [nats] that a posterior would show
 LEARNT_AFTER = (2, 4, 7, 11, 16, 22)  # steps: the inverse that learning needs costs as much as several of them
 
 
@@ -66,7 +67,10 @@ def linearise(squares: Squares, scale: Array, x: Array, hessian: Array) -> State
 def minimise(
     squares: Squares, x: Array, *, num_steps: int, damping: float, tolerance: float, learn: tuple[str, ...] = ()
 ) -> Path:
-    """From x (D,) on; at most num_steps; stop where an undamped step promises less than `tolerance` [nats]."""
+    """From x (D,) on; at most num_steps; stop where a step promises less than `tolerance` [nats].
+
+    Where steps are refused again and again, damping grows until none promises much: that is converged only if an
+    undamped step does not promise more than STALL either."""
     unknown = [name for name in learn if name not in squares.sites]
     if unknown:
         raise InputError(f"learn names {', '.join(unknown)}, but the latents are {', '.join(squares.sites)}")
@@ -82,8 +86,8 @@ def minimise(
             raise FloatingPointError(f"the Hessian has no Cholesky factor (dpotrf says {failed}): it is not finite")
         move = -dpotrs(factor, state.gradient, lower=1)[0]
         promise = float(-state.gradient @ move - 0.5 * move @ state.hessian @ move)
-        converged = promise <= tolerance
-        if converged and (not learn or number > LEARNT_AFTER[1]):
+        if promise <= tolerance and (not learn or number > LEARNT_AFTER[1]):
+            converged = undamped_promise(state) <= max(tolerance, STALL)
             break
         new = linearise(squares, scale, state.x + move, spare)
         gain = state.cost - new.cost
@@ -97,6 +101,12 @@ def minimise(
             state, scale = relearn(squares, state, scale, variance, learn)
         visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
     return Path(state, scale, visited, converged)
+
+
+def undamped_promise(state: State) -> float:
+    """Decrease of the cost [nats] that an undamped step would bring to a linear problem."""
+    factor, _ = dpotrf(state.hessian, lower=1)
+    return 0.5 * float(state.gradient @ dpotrs(factor, state.gradient, lower=1)[0])
 
 
 def relearn(
@@ -142,6 +152,9 @@ def run(
     squares = model.squares(evidence)
     if init is None and hasattr(model, "start"):
         init = model.start(evidence)
+    if init is not None and squares.sites.keys() - init.keys():
+        missing = sorted(squares.sites.keys() - init.keys())
+        raise InputError(f"init has no value for {missing}; it holds {sorted(init)}")
     x = np.zeros(len(squares.loc)) if init is None else (squares.pack(init) - squares.loc) / squares.scale
     path = minimise(squares, x, num_steps=num_steps, damping=damping, tolerance=tolerance, learn=learn)
     factor = np.linalg.cholesky(path.state.hessian)
@@ -149,7 +162,11 @@ def run(
     numbers = path.state.x[:, None] + solve_triangular(factor, noise, trans="T", lower=True)
     times, costs, states = zip(*path.visited, strict=True)
     scales = {name: float(path.scale[part][0]) for name, part in squares.sites.items() if name in learn}
-    left = f"not converged after {num_steps} steps; raise num_steps or start closer (init)"
+    steps = len(states) - 1
+    flag = f"not converged after {num_steps} steps; raise num_steps or start closer (init)"
+    if steps < num_steps:
+        left = f"{undamped_promise(path.state):.2g}"
+        flag = f"not converged: no step lowers the cost, though {left} nats are promised; start elsewhere (init)"
     return Posterior(
         draws={n: v[None] for n, v in squares.unpack(squares.loc + path.scale * numbers.T).items()},
         log_evidence=squares.log_const - path.state.cost - float(np.log(factor.diagonal()).sum()),
@@ -158,10 +175,10 @@ def run(
             "evaluations": len(states),
             "seconds": time.perf_counter() - began,
             "cost": path.state.cost,
-            "steps": len(states) - 1,
+            "steps": steps,
             "converged": path.converged,
             "learnt_scales": scales,
-            "flags": [] if path.converged else [left],
+            "flags": [] if path.converged else [flag],
         },
         snapshots=Snapshots(
             np.arange(len(states)),

@@ -108,7 +108,7 @@ def estimate(
         **fields | {"info": info},
         lanes=Lanes(lines, left, right, routes),
         first=centre_lines(course_evidence, {}),
-        lane_width=float(posterior.estimate["lane_width"]),
+        lane_width=float(posterior.estimate.get("lane_width", course_evidence.loc["lane_width"])),
         courses=posterior,
     )
 

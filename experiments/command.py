@@ -22,7 +22,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from experiments.schema import check_switch, check_values, expand, suggest
+from experiments.schema import UnknownKnob, check_switch, check_values, expand, suggest
 from experiments.signatures import ConfigError
 from experiments.store import check_folder
 
@@ -35,10 +35,33 @@ class SchemaLoader(ConfigLoaderImpl):
     Command-line overrides meet the typed nodes, so that a misspelt key or a wrong type fails there,
     and `--cfg job` shows every default."""
 
-    def _compose_config_from_defaults_list(self, *args: Any, **kwargs: Any) -> DictConfig:
-        config = super()._compose_config_from_defaults_list(*args, **kwargs)
-        expand(config)
+    def _compose_config_from_defaults_list(self, defaults: Any, repo: Any) -> DictConfig:
+        config = super()._compose_config_from_defaults_list(defaults, repo)
+        try:
+            expand(config)
+        except UnknownKnob as error:
+            raise ConfigError(self._from_file(error, defaults, repo)) from None
         return config
+
+    def _from_file(self, error: UnknownKnob, defaults: Any, repo: Any) -> str:
+        """The sentence about a knob that a file sets: the file may have meant another choice of its group."""
+        group, absent = error.path.partition(".")[0], object()
+        key = f"{error.path}.{error.name}"
+        chosen = next((d.config_path for d in defaults if d.config_path.startswith(f"{group}/")), "").partition("/")[2]
+        for default in reversed(defaults):
+            loaded = self._load_single_config(default, repo)
+            if OmegaConf.select(loaded.config, key, default=absent) is absent:
+                continue
+            parts = [d for d in repo.load_config(default.config_path).defaults_list or [] if d.is_override()]
+            meant = next((d.value for d in parts if getattr(d, "group", "").lstrip("/") == group), chosen)
+            if meant == chosen:
+                return f"{error} (set in {default.config_path}.yaml)"
+            choice = default.config_path.replace("/", "=")
+            return (
+                f"{choice} sets {key}, which {group}={meant} takes but {group}={chosen} does not; "
+                f"leave {group} as {choice} has it, or name scenario, model and engine instead of {choice}"
+            )
+        return str(error)
 
     def load_configuration(
         self, config_name: str | None, overrides: list[str], *args: Any, **kwargs: Any

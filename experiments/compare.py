@@ -12,7 +12,7 @@ Each cell is an ordinary stored run, so a comparison resumes and grows without r
 
     time_s         of the engine, the median over seeds: the first run of a process pays for compilation
 
-The reference is the model's exact posterior where it has one, else that of the first engine.
+The reference is the model's exact posterior where it has one, else that of the first engine that ran.
 """
 
 from __future__ import annotations
@@ -41,12 +41,14 @@ class Plan(NamedTuple):
 
     shared  settings of every run
     own     {engine: its settings}
+    named   whether the engines were asked for by name; one of the usual ones may refuse a model
     """
 
     engines: list[str]
     seeds: int
     shared: list[str]
     own: dict[str, list[str]]
+    named: bool
 
 
 class Cell(NamedTuple):
@@ -60,20 +62,24 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One engine: its cells, or the sentence that says why there are none."""
+    """One engine: its cells, or the sentence that says why there are none.
+
+    refused  whether it said that scenario, model and engine do not fit, before any cell
+    """
 
     engine: str
     cells: list[Cell]
     error: str | None
+    refused: bool
 
 
 def plan(words: list[str]) -> Plan:
     """Read the command line. Raises ConfigError for words that say nothing."""
-    engines, seeds, rest = ["rjmcmc", "least_squares"], 3, []
+    engines, seeds, rest, named = ["rjmcmc", "least_squares"], 3, [], False
     for word in words:
         override = OverridesParser.create().parse_override(word)
         if override.key_or_group == "engines":
-            value = override.value()
+            value, named = override.value(), True
             engines = [str(name) for name in (value if isinstance(value, list) else [value])]
             if not engines:
                 raise ConfigError("engines is empty; name one or more, such as engines=[rjmcmc,least_squares]")
@@ -88,7 +94,7 @@ def plan(words: list[str]) -> Plan:
             rest.append(word)
     heads = {word: word.lstrip("+~").partition(".")[0] for word in rest}
     own = {e: [_for_engine(word, e) for word in rest if heads[word] == e] for e in engines}
-    return Plan(engines, seeds, [word for word in rest if heads[word] not in engines], own)
+    return Plan(engines, seeds, [word for word in rest if heads[word] not in engines], own, named)
 
 
 def _for_engine(word: str, engine: str) -> str:
@@ -116,6 +122,7 @@ def gather(jobs: dict[str, list[Job]], say: Callable[[str], None] = print) -> li
     """Run what is not done yet, all engines of one seed first: what cannot work says so at once."""
     cells: dict[str, list[Cell]] = {engine: [] for engine in jobs}
     errors: dict[str, str] = {}
+    refused: set[str] = set()
     for round_of_seed in zip(*jobs.values(), strict=True):
         for engine, job in zip(jobs, round_of_seed, strict=True):
             if engine in errors:
@@ -127,7 +134,9 @@ def gather(jobs: dict[str, list[Job]], say: Callable[[str], None] = print) -> li
             except Exception as error:
                 complain(error, engine)
                 errors[engine] = in_words(error) or f"{type(error).__name__}: {error}"
-    return [Row(engine, cells[engine], errors.get(engine)) for engine in jobs]
+                if in_words(error) and not cells[engine]:
+                    refused.add(engine)
+    return [Row(engine, cells[engine], errors.get(engine), engine in refused) for engine in jobs]
 
 
 def read(folder: Path) -> Cell:
@@ -222,7 +231,8 @@ def main() -> None:
 
 
 def compare(words: list[str]) -> None:
-    """Plan, run, tabulate, store. Raises JobFailed at the end where an engine failed."""
+    """Plan, run, tabulate, store. Raises JobFailed at the end where an engine failed: one that refuses
+    the model only if it was asked for by name or none is left."""
     try:
         chosen = plan(words)
     except OverrideParseException as error:
@@ -235,11 +245,12 @@ def compare(words: list[str]) -> None:
     key = hashlib.sha256("".join(job.name for jobs_ in jobs.values() for job in jobs_).encode()).hexdigest()[:8]
     pair = first.name.removesuffix(first.name[first.name.rindex(f"-{chosen.engines[0]}-") :])
     folder = first.folder.parent / f"compare-{pair}-{key}"
-    title = "exact posterior" if exact else f"posterior of {chosen.engines[0]}"
+    ran = [row.engine for row in rows if row.cells]
+    title = "exact posterior" if exact else f"posterior of {ran[0]}" if ran else "none, no engine ran"
     write(folder, records, rows, f"reference: {title}")
     print_table(records, f"reference: {title}")
     print(f"report     {folder / 'report.html'}")
-    if any(row.error for row in rows):
+    if not ran or any(row.error and (chosen.named or not row.refused) for row in rows):
         raise JobFailed(1)
 
 

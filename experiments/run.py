@@ -111,7 +111,7 @@ def run(
         check(model, evidence)
     say(f"model      {type(model).__name__}")
     with stage("engine"):
-        posterior = engine(model, evidence, seed=engine_seed(seed))
+        posterior = _infer(engine, model, evidence, engine_seed(seed))
     say(f"posterior  {' x '.join(map(str, posterior.shape))} draws in {seconds['engine']:.2f} s")
     with stage("metrics"):
         scores = {name: float(value) for name, value in collect("metric", metrics, posterior, scene).items()}
@@ -123,6 +123,22 @@ def run(
     with stage("figures"):
         drawn = collect("figure", figures, posterior, scene)
     return Result(scene, posterior, scores, found.get("summary", {}), found.get("flags", []), drawn, seconds, failures)
+
+
+def _infer(engine: Engine, model: Any, evidence: Any, seed: int) -> Posterior:
+    """The engine's posterior; a refusal of discrete latents names engines that sample them."""
+    from models.program import InputError
+
+    try:
+        return engine(model, evidence, seed=seed)
+    except InputError as error:
+        if "fix()" not in str(error) or not hasattr(model, "moves"):
+            raise
+        fit = ["engine=rjmcmc"] + (["engine=rjmcmc_structure"] if hasattr(model, "start") else [])
+        raise InputError(
+            f"{type(model).__name__} counts with discrete latents, which this engine does not sample; "
+            f"choose {' or '.join(fit)} (from Python: {error})"
+        ) from error
 
 
 def _name(function: Any) -> str:

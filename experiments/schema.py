@@ -24,6 +24,14 @@ from experiments.signatures import ConfigError, Knob, knobs, locate
 SUPPLIED = frozenset({"model", "evidence", "scene", "posterior", "seed"})  # by run(), to partial targets
 
 
+class UnknownKnob(ConfigError):
+    """A key of the node at `path` that its target does not take."""
+
+    def __init__(self, path: str, name: str, known: Iterable[str]) -> None:
+        super().__init__(f"{path} has no knob '{name}'{suggest(name, known)}")
+        self.path, self.name = path, name
+
+
 def suggest(name: str, known: Iterable[Any]) -> str:
     """'; did you mean ...?', or the list of what there is."""
     names = sorted(map(str, known))
@@ -69,11 +77,11 @@ def expand(config: DictConfig) -> None:
 
 
 def _allowed(path: str, node: DictConfig) -> dict[str, Knob]:
-    """The knobs of a node. Raises ConfigError for a key that is none."""
+    """The knobs of a node. Raises UnknownKnob for a key that is none."""
     allowed = _settable(node)
     for name in map(str, node):
         if name not in allowed and name not in ("_target_", "_partial_"):
-            raise ConfigError(f"{path} has no knob '{name}'{suggest(name, allowed)}")
+            raise UnknownKnob(path, name, allowed)
     return allowed
 
 

@@ -36,6 +36,17 @@ def test_a_biased_engine_stands_out_and_a_broken_one_is_a_row(launch: Command) -
     assert len(Path("calls.txt").read_text().split()) == len(calls.split()) + 1  # the broken one alone
 
 
+def test_an_engine_nobody_asked_for_may_refuse_the_model(launch: Command) -> None:
+    words = ["scenario=slot_road", "model=slot_road", "seeds=1", "rjmcmc.num_steps=60", "rjmcmc.warmup=20"]
+    done = launch(*words, module="experiments.compare")
+    assert done.returncode == 0, done.stderr
+    assert "least_squares: SlotRoad counts with discrete latents" in done.stdout
+    assert "choose engine=rjmcmc (from Python: " in done.stdout
+    done = launch(*words, "engines=[least_squares,rjmcmc]", module="experiments.compare")
+    assert done.returncode == 1
+    assert "reference: posterior of rjmcmc" in done.stdout  # of the first that ran
+
+
 @pytest.mark.parametrize("word", ["engines=[]", "seeds=0", "seeds=two", "engine=rjmcmc", "seed=3"])
 def test_words_that_a_comparison_does_not_take_are_refused(word: str) -> None:
     with pytest.raises(ConfigError, match=r"seeds|engines is empty|engines=\[...\]"):

@@ -81,6 +81,20 @@ def test_a_misspelt_key_is_refused_before_anything_is_written(launch: Command) -
     assert not Path("runs").exists() and not Path("calls.txt").exists()
 
 
+def test_an_experiments_knob_for_another_engine_names_the_experiment(launch: Command) -> None:
+    done = launch("experiment=road", "engine=least_squares")
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "waybayes: experiment=road sets engine.num_chains, which engine=rjmcmc takes but engine=least_squares "
+        "does not; leave engine as experiment=road has it"
+    )
+    Path("conf/engine/mine.yaml").write_text("_target_: fake_engine.run\n_partial_: true\nnum_draw: 3\n")
+    done = launch("--config-dir", "conf", "engine=mine")
+    assert (
+        done.stderr == "waybayes: engine has no knob 'num_draw'; did you mean 'num_draws'? (set in engine/mine.yaml)\n"
+    )
+
+
 BAD_SETTINGS = {
     "seed=-1": "seed is -1; choose 0 or more",
     "scenario.seed=-1": "scenario.seed is -1; choose 0 or more",

@@ -206,16 +206,20 @@ def run(
     if not hasattr(model, "moves"):
         raise InputError(f"rjmcmc needs a model with moves(), but {type(model).__name__} has none")
     if start == "data" and init is None and not hasattr(model, "start"):
-        raise InputError(f"start=data needs a model with start(), but {type(model).__name__} has none; use start=prior")
+        raise InputError(
+            f"start=data needs a model with start(), but {type(model).__name__} has none; "
+            "use start=prior (engine.start=prior on the command line)"
+        )
     if path == "compiled" and not hasattr(model, "kernel"):
         raise InputError(f"path=compiled needs a model with kernel(), but {type(model).__name__} has none")
     if acceptance not in RULES:
         raise InputError(f"acceptance must be one of {', '.join(RULES)}, but is '{acceptance}'")
-    if not 0 <= warmup <= num_steps or num_steps < 1 or num_chains < 1 or num_workers < 1 or start_temperature < 1:
-        raise InputError(
-            "rjmcmc needs 0 <= warmup <= num_steps, num_steps, num_chains and num_workers of at least 1 and "
-            f"start_temperature >= 1, but got {warmup}, {num_steps}, {num_chains}, {num_workers}, {start_temperature}"
-        )
+    counts = {"num_chains": num_chains, "num_steps": num_steps, "num_workers": num_workers}
+    for name, value in (counts | {"start_temperature": start_temperature}).items():
+        if not value >= 1:
+            raise InputError(f"{name} is {value}; rjmcmc needs 1 or more")
+    if not 0 <= warmup <= num_steps:
+        raise InputError(f"warmup is {warmup}; choose 0 to the {num_steps} of num_steps")
     if thin < 1 or thin > max(num_steps - warmup, 1):
         raise InputError(f"thin must be 1 to the {num_steps - warmup} steps after the warm-up, but is {thin}")
     if resample and start_temperature == 1:

@@ -17,7 +17,7 @@ from torch import Tensor
 from inference import calibration, diagnostics, rjmcmc
 from inference.posterior import Posterior
 from models.capability import Move, Proposal
-from models.program import Latents, fix, quiet_doubles, simulate
+from models.program import InputError, Latents, fix, quiet_doubles, simulate
 from models.toys.slot_road import Markings, SlotRoad, offset
 
 # Noise of the size of the offsets leaves every move a fair chance, so that errors show within seconds.
@@ -242,3 +242,18 @@ def test_draws_are_laid_out_as_the_posterior_says() -> None:
     np.testing.assert_array_equal(posterior.model_index, posterior.draws["num_knots"])
     assert set(posterior.info["acceptance"]) <= {move.name for move in model.moves()}
     assert set(diagnostics.summary(posterior)) == {"num_knots", "d0", "psi0", "kappa0"}
+
+
+BAD_KNOBS: dict[str, tuple[dict[str, Any], str]] = {
+    "no chain": ({"num_chains": 0}, "^num_chains is 0; rjmcmc needs 1 or more$"),
+    "cold start": ({"start_temperature": 0.5}, "^start_temperature is 0.5; rjmcmc needs 1 or more$"),
+    "long warm-up": ({"warmup": 60}, "^warmup is 60; choose 0 to the 50 of num_steps$"),
+    "no start": ({"start": "data"}, r"use start=prior \(engine.start=prior on the command line\)$"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_KNOBS)
+def test_a_bad_knob_is_named_alone_with_its_value(case: str) -> None:
+    knobs, message = BAD_KNOBS[case]
+    with pytest.raises(InputError, match=message):
+        rjmcmc.run(ROAD, BLANK, seed=0, **{"num_steps": 50, "warmup": 10} | knobs)

@@ -76,11 +76,11 @@ def find(data_root: str, kind: str, ending: str) -> dict[str, Path]:
 
 
 def pick(name: str, files: dict[str, Path], what: str) -> Path:
-    """The file of a name. Raises InputError with the names that come close."""
+    """The file of a name. Raises InputError with the names that come close, and all there are."""
     if name not in files:
         close = difflib.get_close_matches(name, files, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(files)}"
-        raise InputError(f"no {what} is named '{name}'; {hint}")
+        hint = f"did you mean {' or '.join(close)}? " if close else ""
+        raise InputError(f"no {what} is named '{name}'; {hint}there are {', '.join(files)}")
     return files[name]
 
 

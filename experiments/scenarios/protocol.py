@@ -52,7 +52,7 @@ def protocol(
     Raises InputError for a negative seed, for max_lanes or tracks below one and for an unknown interior.
     """
     if seed < 0:
-        raise InputError(f"scenario protocol: seed is {seed}; choose 0 to 999 for the frozen scenes")
+        raise InputError(f"scenario protocol: seed is {seed}; choose 0 or more (0 to 999 are the frozen scenes)")
     if max_lanes < 1:
         raise InputError(f"scenario protocol: max_lanes is {max_lanes}, but every arm has lanes; choose 1 or more")
     if interior not in get_args(interiors.Kind):

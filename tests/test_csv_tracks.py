@@ -43,7 +43,7 @@ def test_a_table_becomes_tracks_with_a_point_every_metre(tmp_path: Path) -> None
 
 
 def test_columns_in_any_order_recordings_and_compression(tmp_path: Path) -> None:
-    lines = ["colour,y,x,t,recording,vehicle,heading"]
+    lines = ["Colour,Y,x,T,Recording,Vehicle,HEADING"]
     for recording, place in (("one", "0.5,{:.2f}"), ("two", "{:.2f},0.5")):
         lines += [f"red,{place.format(10 * t)},{t:.1f},{recording},7,0.1" for t in np.arange(0.0, 6.0, 0.1)]
     path = tmp_path / "tracks.csv.gz"
@@ -58,7 +58,7 @@ def test_stops_leave_no_points() -> None:
     x = np.concatenate([np.arange(0, 20, 0.8), np.full(300, 20.0), np.arange(20, 50, 0.8)])
     points = np.stack([x, np.zeros_like(x)], 1)
     points[25:325] += rng.normal(0, 0.05, (300, 2))  # jitter of standing
-    path, _ = even(Recorded("a", 2, points, None))
+    path, _ = even(Recorded("a", 2, 0.1 * np.arange(len(points)), points, None))
     assert len(path) == pytest.approx(50, abs=2)
     assert np.abs(path[:, 1]).max() < 0.2
     assert (np.diff(path[:, 0]) > 0.5).all()
@@ -67,7 +67,7 @@ def test_stops_leave_no_points() -> None:
 def test_smoothing_keeps_ends_and_headings_that_cross_pi() -> None:
     rows = np.stack([np.linspace(0, -60, 121), np.zeros(121)], 1)
     heading = np.pi + 0.05 * np.where(np.arange(121) % 2, 1, -1)
-    path, direction = even(Recorded("a", 2, rows, np.asarray(paths.wrap(heading))))
+    path, direction = even(Recorded("a", 2, 0.1 * np.arange(121), rows, np.asarray(paths.wrap(heading))))
     np.testing.assert_allclose(path[[0, -1]], [[0, 0], [-60, 0]], atol=1e-9)
     assert direction is not None and np.abs(paths.wrap(direction - np.pi)).max() < 0.06
 
@@ -91,6 +91,10 @@ BAD_TABLES = {
         HEADER + "".join(f"a,{t},{8.4156 + 1e-5 * t},49.0052\n" for t in range(99)),
         r"row 2: x = 8.4156 and y = 49.0052 .* longitude and latitude",
     ),
+    "milliseconds": (HEADER + "".join(f"a,{40 * t},{t},0\n" for t in range(9)), r"40 s apart, .* 1 m, .* milliseconds"),
+    "centimetres": (HEADER + "".join(f"a,{t},{1000 * t},0\n" for t in range(9)), r"1000 m a second, .* centimetres"),
+    "semicolons": ("vehicle;t;x;y\na;0;0;0\n", r"separated by ';'; separate them by commas"),
+    "tabs": ("vehicle\tt\tx\ty\na\t0\t0\t0\n", r"separated by '\\t'; separate them by commas"),
     "headings in degrees": (
         "vehicle,t,x,y,heading\na,0,0,0,0\na,1,40,0,181.5\n",
         r"row 3, vehicle a: heading is 181.5, beyond 2 pi",
@@ -106,6 +110,11 @@ def test_a_bad_table_gets_one_sentence_with_file_place_and_remedy(case: str, tmp
         csv(path)
     assert str(error.value).startswith(path)
     assert "\n" not in str(error.value) and "; " in str(error.value)
+
+
+def test_a_negative_shortest_length_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="min_length is -5; give 0 m or more"):
+        csv(str(tmp_path / "tracks.csv"), min_length=-5)
 
 
 @pytest.mark.parametrize("heading_std", [None, 0.1])

@@ -1,6 +1,6 @@
 """Tracks of real vehicles from a table: read with care, then made even along their path.
 
-One row a vehicle and time step, columns in any order: vehicle, t [s], x, y [m], and, where
+One row a vehicle and time step, columns in any order and case: vehicle, t [s], x, y [m], and, where
 measured, heading [rad]; `recording` where vehicle numbers repeat between recordings. Other columns are
 ignored.
 """
@@ -25,6 +25,7 @@ REQUIRED = ("vehicle", "t", "x", "y")
 MIN_LENGTH = 30.0  # shorter tracks mislead more than they tell: findings on recorded traffic [m]
 STEP = 1.0  # between points, [M20] section V [m]
 STOPPED = 0.5  # steps shorter than this are standing and its jitter [m]
+FASTEST = 100.0  # the middle one of the vehicles is slower, from its first to its last point [m/s]
 SMOOTHING = 1.5  # standard deviation of the Gaussian window along the path [m]
 
 
@@ -33,12 +34,14 @@ class Recorded(NamedTuple):
 
     vehicle  as messages name it
     row      of its first entry in the file
+    t        (n,) [s]
     points   (n, 2) [m]
     heading  (n,) [rad], None where not measured
     """
 
     vehicle: str
     row: int
+    t: Floats
     points: Floats
     heading: Floats | None
 
@@ -50,6 +53,8 @@ def csv(path: str, min_length: float = MIN_LENGTH) -> Scene:
 
     Coordinates stay as given. Raises InputError with file, row, column, value and remedy for
     whatever cannot be read, and where no vehicle crosses anything."""
+    if not min_length >= 0:
+        raise InputError(f"scenario csv: min_length is {min_length:g}; give 0 m or more")
     vehicles = read(path)
     pieces = [even(vehicle) for vehicle in vehicles]
     lengths = [paths.arc_length(points)[-1] for points, _ in pieces]
@@ -149,7 +154,7 @@ def read(path: str | Path, types: tuple[str, ...] | None = None) -> list[Recorde
 
     Raises InputError for a file that is missing, empty or no table, for missing columns, for values
     that are no numbers, for times that do not increase within a vehicle, for degrees instead of metres
-    or radians and where every vehicle has a single point."""
+    or radians, for milliseconds or centimetres, and where every vehicle has a single point."""
     rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
     first: dict[tuple[str, str], int] = {}
     has_heading = False
@@ -173,7 +178,7 @@ def read(path: str | Path, types: tuple[str, ...] | None = None) -> list[Recorde
     for key, entries in rows.items():
         array = np.array(entries)
         heading = array[:, 3] if has_heading else None
-        vehicles.append(Recorded(key[1], first[key], array[:, 1:3], heading))
+        vehicles.append(Recorded(key[1], first[key], array[:, 0], array[:, 1:3], heading))
     _check_all(path, vehicles)
     return vehicles
 
@@ -187,6 +192,11 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
             header = reader.fieldnames or []
             if not header:
                 raise InputError(f"{path}: the file is empty; give a table with the columns {', '.join(REQUIRED)}")
+            if len(header) == 1 and (found := next((d for d in ";\t|" if d in header[0]), None)):
+                raise InputError(
+                    f"{path}: columns are separated by {found!r}; separate them by commas, decimals by points"
+                )
+            header = reader.fieldnames = [column.strip().lower() for column in header]
             missing = [column for column in REQUIRED if column not in header]
             if missing:
                 raise InputError(
@@ -229,7 +239,7 @@ def _check_row(where: str, values: tuple[float, ...], before: list[tuple[float, 
 
 
 def _check_all(path: str | Path, vehicles: list[Recorded]) -> None:
-    """Vehicles move, and in metres."""
+    """Vehicles move, in metres and seconds."""
     if all(len(vehicle.points) == 1 for vehicle in vehicles):
         raise InputError(
             f"{path}: each of the {len(vehicles)} vehicles has a single point, the first is vehicle "
@@ -242,4 +252,18 @@ def _check_all(path: str | Path, vehicles: list[Recorded]) -> None:
         raise InputError(
             f"{path}, row {vehicles[0].row}: x = {x:g} and y = {y:g} span only {extent[0]:.2g} and {extent[1]:.2g}, "
             "which looks like degrees of longitude and latitude; project them to metres, for example to UTM"
+        )
+    moving = [vehicle for vehicle in vehicles if len(vehicle.points) > 1]
+    pause = np.median(np.concatenate([np.diff(v.t) for v in moving]))
+    step = np.median(np.concatenate([np.hypot(*np.diff(v.points, axis=0).T) for v in moving]))
+    if pause > 10.0 and step < 5.0:
+        raise InputError(
+            f"{path}: rows of a vehicle are {pause:g} s apart, but its points only {step:.2g} m, "
+            "which looks like milliseconds; give t in seconds"
+        )
+    speed = np.median([math.dist(v.points[0], v.points[-1]) / (v.t[-1] - v.t[0]) for v in moving])
+    if speed > FASTEST:
+        raise InputError(
+            f"{path}: vehicles cover {speed:.0f} m a second, which looks like centimetres or other units; "
+            "give x and y in metres and t in seconds"
         )

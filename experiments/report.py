@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 import traceback
+from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from experiments.command import in_short
+from experiments.signatures import source_of
 
 if TYPE_CHECKING:
     from experiments.run import Result
@@ -20,6 +23,8 @@ UNITS = {
     "m": "m", "cm": "cm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
     "sd": "sd", "nats": "nats", "pct": "%", "hz": "Hz",
 }  # fmt: skip
+
+WORDS = {"r_hat": "R-hat", "ess_bulk": "effective draws", "mcse": "standard error of the mean"}
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; max-width: 62rem; margin: 2.5rem auto; padding: 0 1.5rem }
@@ -57,10 +62,8 @@ def write_report(
         _flags(result.flags),
         f"<h2>Arms found</h2>{table(tuple(map(head, arms[0])), [tuple(a.values()) for a in arms])}" if arms else "",
         "<h2>Scores</h2>",
-        table(("metric", "value", "unit"), [(label, v, unit) for (label, unit), v in _labelled(result.scores)])
-        if result.scores
-        else unscored,
-        "".join(f"<h2>{escape(name)}</h2>{image}" for name, image in images.items()),
+        _scores(result.scores, manifest["config"].get("metrics", [])) if result.scores else unscored,
+        "".join(f"<h2>{_words(name)}</h2>{image}" for name, image in images.items()),
         "<h2>Convergence</h2>",
         _by_name(result.diagnostics),
         "<h2>Engine</h2>",
@@ -101,8 +104,23 @@ def _failures(failures: dict[str, Exception]) -> str:
     return "".join(boxes)
 
 
-def _labelled(scores: dict[str, float]) -> list[tuple[tuple[str, str], float]]:
-    return [(split_unit(name), value) for name, value in scores.items()]
+def _scores(scores: dict[str, float], metrics: list[dict[str, Any]]) -> str:
+    says = meanings(scores, (metric["_target_"].rpartition(".")[0] for metric in metrics))
+    rows = [(label, scores[name], unit, says.get(name, "")) for name in scores for label, unit in [split_unit(name)]]
+    return table(("metric", "value", "unit", "meaning"), rows)
+
+
+def meanings(scores: Iterable[str], modules: Iterable[str]) -> dict[str, str]:
+    """What docstrings of the metrics' modules say of scores, in lines 'name  meaning'."""
+    text = "\n".join(file.read_text() for module in dict.fromkeys(modules) if (file := source_of(module)))
+    lines = {name: re.search(rf"^ +{re.escape(name)}  +(\S.*)$", text, re.MULTILINE) for name in scores}
+    return {name: line[1] for name, line in lines.items() if line}
+
+
+def _words(name: str) -> str:
+    """A name as a heading."""
+    words = name.replace("_", " ")
+    return escape(words[:1].upper() + words[1:])
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -156,9 +174,9 @@ def engine_tables(info: dict[str, Any], log_evidence: float | None) -> str:
     parts = [table(("", "value"), plain)]
     for name, values in info.items():
         if isinstance(values, dict) and values and name != "flags":
-            parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2>{_by_name(values)}")
+            parts.append(f"<h2>{_words(name)}</h2>{_by_name(values)}")
         elif isinstance(values, list | tuple) and values and name != "flags":
-            parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2><p>{escape(', '.join(map(number, values)))}</p>")
+            parts.append(f"<h2>{_words(name)}</h2><p>{escape(', '.join(map(number, values)))}</p>")
     return "".join(parts)
 
 
@@ -166,7 +184,10 @@ def _by_name(values: dict[str, Any]) -> str:
     """A table of a dictionary; where its values are dictionaries, one column for each of their keys."""
     if all(isinstance(v, dict) for v in values.values()):
         columns = list(dict.fromkeys(key for v in values.values() for key in v))
-        return table(("", *columns), [(name, *(v.get(c, "") for c in columns)) for name, v in values.items()])
+        return table(
+            ("", *(WORDS.get(c, c) for c in columns)),
+            [(name, *(v.get(c, "") for c in columns)) for name, v in values.items()],
+        )
     return table(("", "value"), list(values.items()))
 
 
@@ -179,6 +200,7 @@ def details(title: str, content: Any) -> str:
 def page(title: str, body: str) -> str:
     """A whole HTML page, without outside resources."""
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
         f"<style>{STYLE}</style></head><body>{body}</body></html>"
     )

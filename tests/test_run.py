@@ -10,6 +10,7 @@ import pytest
 
 from experiments import store
 from experiments.metrics import site_error
+from experiments.report import meanings
 from experiments.run import engine_seed, run, show
 from experiments.scenarios import csv_tracks
 from experiments.scenarios.protocol import protocol
@@ -39,6 +40,9 @@ def test_a_run_leaves_a_complete_folder_and_an_identical_one_is_skipped(launch: 
     assert {"date", "git", "hardware", "seconds", "scene"} <= manifest.keys()
     report = (folder / "report.html").read_text()
     assert "data:image/png;base64," in report
+    assert '<meta name="viewport"' in report
+    for heading in ("R-hat", "effective draws", "standard error of the mean", "<h2>Marginals</h2>"):
+        assert heading in report, heading
     assert "http://" not in report and "https://" not in report
     assert Posterior.load(folder).draws["beta"].shape == (2, 200, 2)
 
@@ -49,6 +53,11 @@ def test_a_run_leaves_a_complete_folder_and_an_identical_one_is_skipped(launch: 
     assert third.returncode == 0, third.stderr
     assert len(Path("calls.txt").read_text().split()) == 2
     assert [path.name for path in Path("runs").iterdir()] == [folder.name]
+
+
+def test_scores_are_explained_by_the_docstrings_of_their_metrics() -> None:
+    says = meanings(["centre_error_m", "beta_error_sd"], ["experiments.junction_metrics", "experiments.metrics"])
+    assert says == {"centre_error_m": "distance of the centres"}
 
 
 def test_the_arms_of_tracks_without_truth_are_told(launch: Command) -> None:

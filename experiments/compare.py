@@ -200,7 +200,9 @@ def against(summary: Summary, reference: Summary, by_position: bool) -> dict[str
 
 
 def tabulate(rows: list[Row], exact: Summary | None) -> list[dict[str, Any]]:
-    """One record for each engine: mean and sd over its seeds of every score, and its distance to the reference."""
+    """One record for each engine: mean and sd over its seeds of every score, and its distance to the reference.
+
+    Scores that are 0 or 1 have their share alone, which says all."""
     import numpy as np
 
     reference = exact or next((pooled(row.cells) for row in rows if row.cells), {})
@@ -215,7 +217,8 @@ def tabulate(rows: list[Row], exact: Summary | None) -> list[dict[str, Any]]:
                 known = np.array([v for v in values if v is not None], dtype=float)
                 centre = np.median if name == "time_s" else np.mean
                 record[name] = float(centre(known)) if len(known) else None
-                record[f"{name}:sd"] = float(known.std(ddof=1)) if len(known) > 1 else None
+                varies = len(known) > 1 and not np.isin(known, (0.0, 1.0)).all()
+                record[f"{name}:sd"] = float(known.std(ddof=1)) if varies else None
             if exact or row.engine != first:
                 record |= against(pooled(row.cells), reference, by_position=exact is not None)
         records.append(record)
@@ -256,7 +259,7 @@ def compare(words: list[str]) -> None:
 
 def _columns(records: list[dict[str, Any]]) -> list[str]:
     names = dict.fromkeys(name for record in records for name in record)
-    return [name for name in names if name != "error" and not name.endswith(":sd")]
+    return [name for name in names if name not in ("engine", "error") and not name.endswith(":sd")]
 
 
 def _entry(record: dict[str, Any], name: str) -> str:
@@ -269,20 +272,18 @@ def _entry(record: dict[str, Any], name: str) -> str:
 
 
 def print_table(records: list[dict[str, Any]], caption: str) -> None:
-    """The table on the terminal; an engine that failed has its error in a line of its own."""
+    """The table on the terminal, a column for each engine; one that failed has its error in a line of its own."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    from experiments.report import split_unit
+    from experiments.report import head
 
     console = Console()
     console.width = console.width if console.is_terminal else 160
-    heads = {name: split_unit(name) for name in _columns(records)}
-    table = Table(caption=caption)
-    for label, unit in heads.values():
-        table.add_column(f"{label}\n[dim]{unit}[/]" if unit else label, no_wrap=label == "engine")
-    for record in records:
-        table.add_row(*(_entry(record, name) for name in heads))
+    table = Table("", *(record["engine"] for record in records), caption=caption)
+    for name in _columns(records):
+        table.add_row(Text(head(name)), *(_entry(record, name) for record in records))
     console.print(table)
     for record in records:
         if record["error"]:
@@ -293,12 +294,12 @@ def write(folder: Path, records: list[dict[str, Any]], rows: list[Row], caption:
     """compare.csv, compare.json and a self-contained report.html in a folder of their own."""
     from experiments.report import details, head, page, table
 
-    names = _columns(records)
-    heads = tuple(map(head, names))
+    heads = ("", *(record["engine"] for record in records))
+    entries = [(head(name), *(_entry(record, name) for record in records)) for name in _columns(records)]
     failed = [(record["engine"], record["error"]) for record in records if record["error"]]
     runs = {row.engine: [cell.folder.name for cell in row.cells] for row in rows}
     body = [f"<h1>{folder.name}</h1><p class='sub'>mean ± sd over seeds; {caption}</p>"]
-    body += [table(heads, [tuple(_entry(record, name) for name in names) for record in records])]
+    body += [table(heads, entries)]
     body += ["<h2>Failed</h2>", table(("engine", "error"), failed)] if failed else []
     body += ["<h2>What the columns mean</h2><pre>", "\n".join((__doc__ or "").splitlines()[7:-1]), "</pre>"]
     body += [details("runs", runs)]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.compare import against, plan
+from experiments.compare import Cell, Row, against, plan, print_table, tabulate
 from experiments.signatures import ConfigError
 from tests.conftest import Command
 
@@ -51,6 +51,18 @@ def test_an_engine_nobody_asked_for_may_refuse_the_model(launch: Command) -> Non
 def test_words_that_a_comparison_does_not_take_are_refused(word: str) -> None:
     with pytest.raises(ConfigError, match=r"seeds|engines is empty|engines=\[...\]"):
         plan([word])
+
+
+def test_shares_have_no_spread_and_no_heading_is_cut(capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"a_rather_long_name_of_score_{i}_m" for i in range(20)]
+    scores = [{"right": float(i), **dict.fromkeys(names, 0.5 + i)} for i in range(2)]
+    cells = [Cell(Path(), score, {}, 1.0, None) for score in scores]
+    records = tabulate([Row("fake", cells, None, False)], None)
+    assert records[0]["right"] == 0.5 and records[0]["right:sd"] is None
+    assert records[0][f"{names[0]}:sd"] == pytest.approx(0.5**0.5)
+    print_table(records, "")
+    said = capsys.readouterr().out
+    assert all(f"a rather long name of score {i} [m]" in said for i in range(20)) and "…" not in said
 
 
 def test_the_distance_to_the_reference_follows_its_definition() -> None:

@@ -64,7 +64,7 @@ def test_the_numbering_of_the_arms_is_that_of_the_estimate() -> None:
 
 
 def test_a_track_beside_all_arms_is_on_no_route() -> None:
-    """It crosses the junction from the middle of one gap between arms to that of another, and changes no other route."""
+    """It crosses the junction from the middle of one gap between arms to that of another and changes no other route."""
     scene = protocol(0, position_std=0.0)
     angle = np.sort(scene.truth.angle)
     between = np.diff(angle, append=angle[0] + 2 * math.pi)

@@ -64,7 +64,7 @@ def test_the_numbering_of_the_arms_is_that_of_the_estimate() -> None:
 
 
 def test_a_track_beside_all_arms_is_on_no_route() -> None:
-    """It crosses the junction from the middle of one gap between arms to that of another and changes no other route."""
+    """It crosses from the middle of one gap between arms to that of another, and changes no other route."""
     scene = protocol(0, position_std=0.0)
     angle = np.sort(scene.truth.angle)
     between = np.diff(angle, append=angle[0] + 2 * math.pi)
@@ -91,7 +91,7 @@ def test_a_track_seen_from_the_last_metres_of_its_entry_goes_by_these() -> None:
     scene = protocol(0, position_std=0.0)
     pieces, true = singles(scene.data), scene.truth.connections[scene.truth.track_lane]
     radius = scene.truth.radius[true[0, 0]]
-    near = np.linalg.norm(pieces[0] - scene.truth.centre, axis=1) < radius + 10.0
+    near = np.linalg.norm(pieces[0] - scene.truth.centre, axis=1) < radius + 6.0
     cut = pieces[0][near.argmax() :]
     found = routes(scene, join_tracks([cut, *pieces[1:]], None))
     np.testing.assert_array_equal(lanes_of(found), true)

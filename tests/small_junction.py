@@ -42,9 +42,9 @@ def blank_evidence(
     sizes = rng.integers(max(num_points - 3, 1), num_points + 4, num_entries + num_exits)
     s = np.concatenate([np.zeros(0), *(20.0 + 40.0 * np.sort(rng.random(n)) for n in sizes)])
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    return JunctionEvidence(
-        None, s, starts, np.arange(len(starts) - 1), len(starts) - 1, num_entries, np.array([3.0, -7.0]), heading, None
-    )
+    num = len(starts) - 1
+    origin = np.array([3.0, -7.0])
+    return JunctionEvidence(None, s, starts, np.arange(num), num, num_entries, origin, heading, None, None)
 
 
 NOTHING = blank_evidence(0, 0)._replace(points=torch.zeros(3, 0, dtype=torch.float64))  # no half track at all

@@ -38,7 +38,7 @@ LEAST_ONSET = 2.0  # [m]
 LEAST_HANDLE, LARGEST_HANDLE = 0.2, 2.0
 SHARPEST = 2.9  # [rad] of turn: sharper ones keep these handles
 
-WAVE_BEGIN, WAVE_PIECE, WAVE_PIECES = 8.0, 8.0, 7  # [m] from the centre; straight on before and beyond
+WAVE_BEGIN, WAVE_PIECE, WAVE_PIECES = 8.0, 8.0, 7  # [m] from the centre; constant before and beyond
 ARM_WAVE = WAVE_PIECES + 3  # controls
 INNER_WAVE = 6  # controls, those of INNER_WAVE + 3 pieces that vanish at both ends
 RIPPLED = LOCAL + INNER_WAVE  # numbers of a lane with a wave of its interior ...

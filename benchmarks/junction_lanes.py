@@ -321,7 +321,7 @@ MEASUREMENTS = (
                 "share",
                 "of the lanes' nodes whose true place is inside the 90 % band, structure right",
             ),
-            Figure("band_coverage_90", "share", "the same, all scenes"),
+            Figure("band_coverage_90", "share", "the same over all scenes, structure right or not"),
         ),
         coverage,
     ),

@@ -20,7 +20,7 @@ from benchmarks.lane_bound import lane_bound
 from benchmarks.lane_papers import m19_refine, m20_refine
 from experiments.junction_metrics import structure
 from experiments.lane_metrics import COST, band_coverage, lane_error
-from experiments.lanes import BAND, Lanes, refine_lanes
+from experiments.lanes import BAND, Lanes, refine_lanes, whole_structure
 from experiments.scenarios.junction import junction, names
 from experiments.scenarios.protocol import protocol
 from experiments.scenarios.scene import Scene
@@ -160,9 +160,8 @@ def papers(effort: Effort) -> Values:
         for seed in range(effort.few):
             scene = protocol(seed)
             trial = refine(default(), scene, seed)
-            model = default().structure.model
-            constants = {n: np.full(len(trial.found.estimate["angle"]), v) for n, v in model.constants.items()}
-            routed = RoutedTracks(scene.data, trial.found.estimate | constants, trial.lanes.routes)
+            structure = whole_structure(default().structure.model, trial.found)
+            routed = RoutedTracks(scene.data, structure, trial.lanes.routes)
             for name, result in (("m20", m20_refine(routed)), ("m19", m19_refine(routed, seed))):
                 lanes[name].append((lane_error(result[0], scene.truth)["lane_error_cm"], result[1]))
             bar.advance(1)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,8 @@ class LanePosterior(Posterior):
         }
         routes = self.lanes.routes._asdict()
         np.savez_compressed(folder / "lanes.npz", allow_pickle=False, **arrays, **routes)
-        width = float(self.lane_width)
-        write_osm(folder / "lanes.osm", lanelet_map(self.lanes.lines, self.lanes.routes.connections, width))
+        lanelets = lanelet_map(self.lanes.lines, self.lanes.routes.connections, self.lane_width)
+        write_osm(folder / "lanes.osm", lanelets)
 
 
 def estimate(
@@ -120,9 +120,15 @@ def refine_lanes(
     if evidence.tracks is None:
         raise InputError("lanes need whole tracks, but this evidence was simulated half by half")
     routes = find_routes(model, evidence, found.estimate)
-    structure = found.estimate | {n: np.full(len(found.estimate["angle"]), v) for n, v in model.constants.items()}
-    course_evidence = courses.prepare(RoutedTracks(evidence.tracks, structure, routes))
+    routed = RoutedTracks(evidence.tracks, whole_structure(model, found), routes)
+    course_evidence = courses.prepare(routed)
     merged = merge_routes(course_evidence, routes, courses.spacing)
     if len(merged.connections) < len(routes.connections):
-        routes, course_evidence = merged, courses.prepare(RoutedTracks(evidence.tracks, structure, merged))
+        routes, course_evidence = merged, courses.prepare(routed._replace(routes=merged))
     return refine(courses, course_evidence, seed=seed), course_evidence, routes
+
+
+def whole_structure(model: Junction, found: Posterior) -> dict[str, NDArray[Any]]:
+    """The estimate with the fields of arms that the model holds constant."""
+    slots = len(found.estimate["angle"])
+    return found.estimate | {name: np.full(slots, value) for name, value in model.constants.items()}

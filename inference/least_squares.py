@@ -97,7 +97,7 @@ def step(bound: Bound, state: State, *, inflation: float = 1.0) -> tuple[State, 
     if bool(failed) or not gain > 0:  # a gain that is NaN is refused here too
         return state._replace(damping=state.damping * state.growth, growth=2.0 * state.growth), False
     ratio = gain / float(-gradient @ move - 0.5 * move @ hessian @ move)
-    damping = state.damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+    damping = state.damping * squares.relaxation(ratio)
     return linearise(bound, x, damping=damping, inflation=inflation), True
 
 

@@ -92,7 +92,7 @@ def minimise(
         new = linearise(squares, scale, state.x + move, spare)
         gain = state.cost - new.cost
         if gain > 0:
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / max(promise, 1e-12) - 1.0) ** 3)
+            damping *= relaxation(gain / max(promise, 1e-12))
             state, spare, growth = new, state.hessian, 2.0
         else:
             damping, growth = damping * growth, 2.0 * growth
@@ -101,6 +101,11 @@ def minimise(
             state, scale = relearn(squares, state, scale, variance, learn)
         visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
     return Path(state, scale, visited, converged)
+
+
+def relaxation(ratio: float) -> float:
+    """Factor on the damping after a step that gained `ratio` of what it promised (Madsen et al. 2004, alg. 3.16)."""
+    return max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
 
 
 def undamped_promise(state: State) -> float:

@@ -486,27 +486,17 @@ def test_tracks_without_a_route_are_refused() -> None:
 # Recovery
 
 
-def test_bent_arms_are_recovered() -> None:
-    """Bends of 0.002 / m put lanes 0.6 m off their chords; taken for straight they break the bound of the noise."""
-    model = replace(MANY, bend_std=0.002)
+@pytest.mark.parametrize(("site", "std", "largest"), [("bend", 0.002, 0.001), ("offset", 3.0, 5.0)])
+def test_bent_arms_and_slip_lanes_are_recovered(site: str, std: float, largest: float) -> None:
+    """Bends of 0.002 / m put lanes 0.6 m off their chords, and slip lanes run metres beside their neighbours; held at
+    the prior's middle, both break the bound of the noise."""
+    model = replace(MANY, **{f"{site}_std": std})
     scene = simulated(model, 3)
-    assert np.abs(scene.latents["bend"]).max() > 0.001
-    found, straight = (
-        least_squares.run(m, scene.evidence, seed=0).estimate for m in (model, replace(model, bend_std=0.0))
-    )
+    assert np.abs(scene.latents[site]).max() > largest
+    models = (model, replace(model, **{f"{site}_std": 0.0}))
+    found, held = (least_squares.run(m, scene.evidence, seed=0).estimate for m in models)
     bound = noise_bound(scene, size_of(found))
-    assert root_mean_square(scene, found) < bound < root_mean_square(scene, straight)
-
-
-def test_a_slip_lane_far_from_its_neighbours_is_recovered() -> None:
-    model = replace(MANY, offset_std=3.0)
-    scene = simulated(model, 3)
-    assert np.abs(scene.latents["offset"]).max() > 5.0
-    found, tied = (
-        least_squares.run(m, scene.evidence, seed=0).estimate for m in (model, replace(model, offset_std=0.0))
-    )
-    bound = noise_bound(scene, size_of(found))
-    assert root_mean_square(scene, found) < bound < root_mean_square(scene, tied)
+    assert root_mean_square(scene, found) < bound < root_mean_square(scene, held)
 
 
 @pytest.mark.parametrize("exit_arm", [-1.0, math.pi / 2], ids=["left", "right"])

@@ -110,8 +110,9 @@ def complete_ends(
         apart = np.linalg.norm(lines[None] - pieces.mean(1)[:, None, None], axis=-1)  # (M, lanes, n)
         nearest = apart.argmin(-1)
         steps = np.gradient(lines, axis=1)[np.arange(len(lines)), nearest]  # (M, lanes, 2) outwards
-        turn = wrap_angles(np.arctan2(course[:, 1], course[:, 0])[:, None] - np.arctan2(steps[..., 1], steps[..., 0]))
-        cost = np.where(np.abs(turn) < ALONG, apart.min(-1), np.inf)
+        aligned = (steps * course[:, None]).sum(-1)  # |step| |course| cos(turn)
+        lengths = np.linalg.norm(steps, axis=-1) * np.linalg.norm(course, axis=-1)[:, None]
+        cost = np.where(aligned > math.cos(ALONG) * lengths, apart.min(-1), np.inf)
         best = cost.argmin(1)
         found = cost.min(1) < CLOSE
         ends[missing[found], end : end + 2] = names[best[found]]
@@ -124,8 +125,3 @@ def _arm_lanes(model: Junction, estimate: Mapping[str, NDArray[Any]], side: Lite
     names = np.array([(arm, lane) for arm, count in enumerate(counts) for lane in range(-1, int(count) + 1)])
     s = np.arange(0.0, 80.0)
     return names, np.stack([lane_points(estimate, arm, lane, side, s, model.width) for arm, lane in names])
-
-
-def wrap_angles(angle: Array) -> Array:
-    """Angles in [-pi, pi)."""
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -49,7 +49,7 @@ def lane_bound(truth: JunctionTruth, heading_std: float | None = None, tracks_pe
     tracks_per_lane  vehicles on each lane, 4 in the mean of the protocol
 
     The lines of the truth say only how far lanes were driven: interiors are Bezier curves, their handles in the middle
-    of the prior (the true ones change the mean over scenes by less than 0.01 cm)."""
+    of the prior."""
     evidence = true_courses(truth)
     information = np.diag(np.concatenate([np.full(evidence.loc[n].size, std**-2.0) for n, std in PRIOR_STD.items()]))
     lanes = []

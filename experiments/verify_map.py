@@ -4,9 +4,8 @@
 
 n of N draws of the structure posterior differ from the map; the halves keep odds finite: no odds lie beyond 2N + 1,
 nor is anything surer than that. Draws of a chain resemble each other, so that odds near these ends say less than their
-size; the run's flags tell where chains disagree. Chains that never left a wrong structure count as much as the others:
-on 30 scenes of the protocol the odds of the whole map were above 1 for all maps with an entry added and an exit
-removed, and for 11 of the right ones.
+size; the run's flags tell where chains disagree. Chains that never left a wrong structure count as much as the others,
+so that the odds of the whole map raise more false alarms than those of its lanes.
 
 These are posterior odds under the prior of `Junction`, which knows nothing of the map: lane counts uniform on 0 to
 max_lanes, the number of arms uniform on 2 to 7. Multiply them by how much less (or more) often than that a

@@ -1,4 +1,4 @@
-"""Copy a vector in machine code. numba compiles `target[:] = source` for two seconds, error texts included."""
+"""Copy a vector in machine code. numba compiles `target[:] = source` for long, error texts included."""
 
 import numba as nb
 

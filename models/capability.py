@@ -4,6 +4,7 @@
     start(evidence)    a data-driven first state, {site: (*event)}
     kernel(evidence)   a compiled density over a packed state
     squares(evidence)  a compiled sum of squares of normal latents, for least squares without tracing the program
+    factors(evidence)  the whitened density factor by factor in machine code, for engines that evaluate batches
     dimension          name of the site that counts the active slots
 
 A move is an involution on (state, auxiliary numbers): (z, u) -> (z', u') and back, with u uniform
@@ -176,3 +177,34 @@ class HasSquares(Protocol):
     def __call__(self, evidence: Any) -> None: ...
 
     def squares(self, evidence: Any) -> Squares: ...
+
+
+class Factors(NamedTuple):
+    """A whitened density as a product of factors, evaluated for a whole batch.
+
+        log p(z, y) + log |dz / dx| = sum_d log N(x_d; 0, 1) + sum_k f_k(x),   z = T(x) all latents
+
+    evaluate  x (S, D) -> f (S, K)
+    gradient  x (S, D) -> (sum_k f_k (S,), its gradient (S, D))
+    depends   (K, D) whether factor k may read number d: what Rao-Blackwellisation and blocks go by
+    sites     {site: part of x}
+    latents   x (*batch, D) -> {site: (*batch, *event)}
+    whiten    {site: (*event)} -> x (D,)
+    """
+
+    evaluate: Callable[[np.ndarray], np.ndarray]
+    gradient: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    depends: np.ndarray
+    sites: dict[str, slice]
+    latents: Callable[[np.ndarray], dict[str, np.ndarray]]
+    whiten: Callable[[dict[str, Any]], np.ndarray]
+
+
+@runtime_checkable
+class HasFactors(Protocol):
+    """A program that offers its whitened density factor by factor. Where it offers squares too, their numbers are the
+    same x: loc 0 and scale 1, or the same order of latents under the same prior."""
+
+    def __call__(self, evidence: Any) -> None: ...
+
+    def factors(self, evidence: Any) -> Factors: ...

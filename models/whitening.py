@@ -220,12 +220,15 @@ class Bound:
             parts.append(part.reshape(*batch, -1))
         return torch.cat(parts, -1)
 
-    def log_density(self, x: Tensor) -> Tensor:
-        """log N(x; 0, I) + log p(y | T(x)), (*batch): log_joint plus the log Jacobian of T."""
+    def log_likelihoods(self, x: Tensor) -> dict[str, Tensor]:
+        """Log density of every observed or frozen site at T(x), {site: (*batch)}."""
         sites = self._run(x)
         plates = num_plate_dims(sites)
-        likelihood = {n: sum_plates(site_log_prob(n, s), plates) for n, s in sites.items() if s["is_observed"]}
-        return -0.5 * (x.square() + math.log(2 * math.pi)).sum(-1) + total(likelihood)
+        return {n: sum_plates(site_log_prob(n, s), plates) for n, s in sites.items() if s["is_observed"]}
+
+    def log_density(self, x: Tensor) -> Tensor:
+        """log N(x; 0, I) + log p(y | T(x)), (*batch): log_joint plus the log Jacobian of T."""
+        return -0.5 * (x.square() + math.log(2 * math.pi)).sum(-1) + total(self.log_likelihoods(x))
 
     def residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Prior residuals x (size) and whitened residuals of observed and frozen sites (M), x unbatched."""

@@ -1,0 +1,48 @@
+"""Factors of a program: what engines that evaluate batches see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from inference.factors import factored
+from models.program import InputError, simulate
+from models.toys.gaussian import ConjugateGaussian, Readings
+from models.toys.slot_road import Markings, SlotRoad
+from models.whitening import bind
+
+MODEL = ConjugateGaussian()
+BLANK = Readings(torch.linspace(-1.0, 1.0, 20, dtype=torch.float64), None)
+EVIDENCE = BLANK._replace(y=simulate(MODEL, BLANK, num=1, seed=3)["y"][0])
+X = np.random.default_rng(0).standard_normal((5, 2))
+
+
+def test_factors_and_prior_are_the_bound_density() -> None:
+    height = factored(MODEL, EVIDENCE).evaluate(X).sum(-1) - 0.5 * (X**2 + np.log(2 * np.pi)).sum(-1)
+    assert height == pytest.approx(bind(MODEL, EVIDENCE).log_density(torch.from_numpy(X)).numpy(), rel=1e-12)
+
+
+def test_gradient_is_that_of_the_factors_at_every_point() -> None:
+    factors, eps = factored(MODEL, EVIDENCE), 1e-6
+    for moved in (0.0, 1.0):
+        x = X + moved
+        value, slope = factors.gradient(x)
+        assert value == pytest.approx(factors.evaluate(x).sum(-1), rel=1e-12)
+        for d in range(2):
+            step = eps * np.eye(2)[d]
+            apart = factors.evaluate(x + step).sum(-1) - factors.evaluate(x - step).sum(-1)
+            assert slope[:, d] == pytest.approx(apart / (2 * eps), rel=1e-6)
+
+
+def test_latents_and_whiten_are_inverse() -> None:
+    factors = factored(MODEL, EVIDENCE)
+    beta = factors.latents(X)["beta"]
+    assert beta == pytest.approx(X * np.array(MODEL.prior_std), rel=1e-12)
+    assert factors.whiten({"beta": beta[3]}) == pytest.approx(X[3], rel=1e-12)
+
+
+def test_discrete_latents_are_refused_by_name() -> None:
+    s = torch.linspace(0.0, 50.0, 4, dtype=torch.float64)
+    with pytest.raises(InputError, match="num_knots"):
+        factored(SlotRoad(), Markings(s, torch.zeros(4, dtype=torch.float64)))

@@ -40,3 +40,40 @@ def test_systematic_resampling_is_unbiased() -> None:
     grid = (np.arange(1000) + 0.5) / 1000
     counts = np.mean([np.bincount(weights.systematic(log_weights, 7, u), minlength=3) for u in grid], axis=0)
     np.testing.assert_allclose(counts, 7 * np.array([0.1, 0.25, 0.65]), atol=2e-3)
+
+
+def test_log_mean_and_relative_error_are_those_of_the_weights() -> None:
+    log_weights = np.random.default_rng(0).normal(size=50)
+    w = np.exp(log_weights)
+    assert weights.log_mean(log_weights - 700.0) == pytest.approx(np.log(w.mean()) - 700.0)
+    assert weights.relative_error(log_weights) == pytest.approx(w.std() / w.mean() / np.sqrt(50))
+
+
+def test_tempered_weights_have_the_size_asked_for() -> None:
+    log_weights = 10.0 * np.random.default_rng(0).normal(size=200)
+    power = weights.temper(log_weights, 100.0)
+    assert weights.effective_size(power * log_weights) == pytest.approx(100.0, rel=1e-4)
+    assert weights.temper(log_weights, 100.0, most=0.5 * power) == 0.5 * power
+    assert weights.temper(np.zeros(200), 100.0) == 1.0
+    zeros = np.where(np.arange(200) < 150, -np.inf, 0.0)
+    assert 0.0 < weights.temper(zeros, 100.0) < 1e-12
+
+
+@pytest.mark.parametrize("spread", [0.3, 1.0, 3.0])
+def test_pareto_shape_is_that_of_arviz(spread: float) -> None:
+    log_weights = spread * np.random.default_rng(1).normal(size=2000)
+    import arviz
+
+    assert weights.pareto_k(log_weights) == pytest.approx(float(arviz.psislw(log_weights)[1]), abs=1e-9)
+
+
+def test_pareto_shape_of_pareto_weights_is_theirs() -> None:
+    """Weights with tail P(w > t) = t^(-1/k); of 600 in the fit, the standard error is about (1 + k) / sqrt(600)."""
+    uniforms = np.random.default_rng(2).random(40000)
+    for k in (0.4, 0.9):
+        assert weights.pareto_k(-k * np.log(uniforms)) == pytest.approx(k, abs=3 * (1 + k) / np.sqrt(600))
+
+
+def test_a_handful_of_weights_has_no_tail() -> None:
+    assert np.isnan(weights.pareto_k(np.zeros(10)))
+    assert np.isnan(weights.pareto_k(np.zeros(1000)))

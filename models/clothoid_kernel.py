@@ -1,0 +1,89 @@
+"""Clothoids in machine code, for compiled densities: the equations are those of models.clothoid.
+
+Nothing here raises. Ends that no sane clothoid joins get length inf, curvature and rate 0: test the length before
+the numbers are used.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from models.intersection.wrap import wrap
+
+X, Y, HEADING, CURVATURE, RATE, LENGTH = range(6)  # numbers of a clothoid, ordered as models.clothoid.Clothoid
+COS, SIN, BEND = 3, 4, 5  # columns of a table after x, y and heading; the last is the curvature
+COLUMNS = 6
+
+MAX_STRETCH = 8.0  # length over chord beyond which ends are refused: they point away from each other
+MIN_CHORD = 1e-6  # [m]: nearer ends have no direction
+# sin(bow) averages zero near bow = (p + q) * polynomial in p / pi, q / pi: Bertolazzi and Frego (2013), section 4
+GUESS = (2.989696028701907, 0.716228953608281, -0.458969738821509, -0.502821153340377, 0.261062141752652)
+GUESS_LAST = -0.045854475238709
+_x, _w = np.polynomial.legendre.leggauss(16)
+NODES, WEIGHTS = (_x + 1.0) / 2.0, _w / 2.0  # Gauss-Legendre on [0, 1]
+NEWTON_STEPS = 6  # at most; the fifth changes nothing for any headings
+SETTLED = 1e-9  # [rad]; the step squares the error
+
+
+@nb.njit(error_model="numpy")
+def guess_bow(p, q):  # type: ignore[no-untyped-def]
+    """A start for the Newton steps: within 0.6 rad of the bow for any p and q, and far nearer on roads."""
+    a, b = p / math.pi, q / math.pi
+    ab, squares = a * b, a * a + b * b
+    inner = GUESS[0] + ab * (GUESS[1] + ab * GUESS[2]) + (GUESS[3] + ab * GUESS[4]) * squares
+    return (p + q) * (inner + GUESS_LAST * squares * squares)
+
+
+@nb.njit(error_model="numpy")
+def hermite_one(x0, y0, heading0, x1, y1, heading1, out):  # type: ignore[no-untyped-def]
+    """The clothoid from (x0, y0, heading0) to (x1, y1, heading1) into out (6,): x, y, heading, curvature, rate, length
+    [m, m, rad, 1/m, 1/m^2, m]."""
+    out[X], out[Y], out[HEADING], out[CURVATURE], out[RATE], out[LENGTH] = x0, y0, heading0, 0.0, 0.0, np.inf
+    dx, dy = x1 - x0, y1 - y0
+    chord, along = math.hypot(dx, dy), math.atan2(dy, dx)
+    p, q = wrap(heading0 - along), wrap(heading1 - along)
+    if not (MIN_CHORD < chord < np.inf and math.isfinite(p) and math.isfinite(q)):
+        return
+    bow = guess_bow(p, q)
+    for _ in range(NEWTON_STEPS):
+        value = slope = 0.0
+        for i in range(len(NODES)):
+            t = NODES[i]
+            angle = bow * (t * t - t) + (q - p) * t + p
+            value += WEIGHTS[i] * math.sin(angle)
+            slope += WEIGHTS[i] * (t * t - t) * math.cos(angle)
+        bow -= value / slope
+        if abs(value / slope) < SETTLED:
+            break
+    shrink = 0.0
+    for i in range(len(NODES)):
+        t = NODES[i]
+        shrink += WEIGHTS[i] * math.cos(bow * (t * t - t) + (q - p) * t + p)
+    if shrink * MAX_STRETCH >= 1.0:
+        out[LENGTH] = chord / shrink
+        out[CURVATURE], out[RATE] = (q - p - bow) / out[LENGTH], 2.0 * bow / out[LENGTH] ** 2
+
+
+@nb.njit(error_model="numpy")
+def sample_one(clothoid, table):  # type: ignore[no-untyped-def]
+    """Samples at equal steps of arc length, both ends included, into table (num, 6): x, y, heading, its cosine and
+    sine, curvature. clothoid (6,) as hermite_one fills it, of finite length; returns the step [m]."""
+    last = len(table) - 1
+    step, heading0, curvature, rate = clothoid[LENGTH] / last, clothoid[HEADING], clothoid[CURVATURE], clothoid[RATE]
+    x, y, cos, sin = clothoid[X], clothoid[Y], math.cos(heading0), math.sin(heading0)
+    heading = heading0
+    for k in range(len(table)):
+        s = k * step
+        table[k, X], table[k, Y], table[k, HEADING] = x, y, heading
+        table[k, COS], table[k, SIN], table[k, BEND] = cos, sin, curvature + rate * s
+        middle, s = s + 0.5 * step, s + step
+        between = heading0 + middle * (curvature + 0.5 * rate * middle)
+        heading = heading0 + s * (curvature + 0.5 * rate * s)
+        cos1, sin1 = math.cos(heading), math.sin(heading)
+        x += step / 6.0 * (cos + 4.0 * math.cos(between) + cos1)
+        y += step / 6.0 * (sin + 4.0 * math.sin(between) + sin1)
+        cos, sin = cos1, sin1
+    return step

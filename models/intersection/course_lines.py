@@ -82,22 +82,37 @@ def lane_nodes(evidence: CourseEvidence, latents: Mapping[str, Any]) -> list[Arr
     return out
 
 
-def lane_bands(
-    evidence: CourseEvidence, estimate: Mapping[str, Any], draws: Mapping[str, Array], level: float
-) -> tuple[list[Array], list[Array]]:
-    """How far left and right of the estimate's centre lines the draws' lines lie, L arrays (n,) each [m].
+def lane_displacements(
+    evidence: CourseEvidence, estimate: Mapping[str, Any], draws: Mapping[str, Array]
+) -> list[Array]:
+    """How far to the left of the estimate's centre lines the draws' lines lie, L arrays (n, D) [m].
 
-    draws  {site: (D, *event)}, equally weighted; displacements are linear in what separates a draw from the
-    estimate. Between the two edges lies the share `level` of the draws at each point, half of the rest on either
-    side."""
+    draws  {site: (D, *event)}; displacements are linear in what separates a draw from the estimate"""
     layout = layout_of(evidence, estimate)
     here = layout.pack(evidence.loc | dict(estimate))
     num = len(next(iter(draws.values())))
     there = [draws.get(n, np.broadcast_to(evidence.loc[n], (num, *evidence.loc[n].shape))) for n in layout.sites]
     apart = np.concatenate([values.reshape(num, -1) for values in there], 1) - here
+    pairs = zip(lane_nodes(evidence, estimate), layout.where, strict=True)
+    return [nodes[:, 5:] @ apart[:, index].T for nodes, index in pairs]
+
+
+def lane_bands(
+    evidence: CourseEvidence, estimate: Mapping[str, Any], draws: Mapping[str, Array], level: float
+) -> tuple[list[Array], list[Array]]:
+    """How far left and right of the estimate's centre lines the draws' lines lie, L arrays (n,) each [m].
+
+    draws  {site: (D, *event)}, equally weighted, see `lane_displacements`"""
+    return edges(lane_displacements(evidence, estimate, draws), level)
+
+
+def edges(displacements: Iterable[Array], level: float) -> tuple[list[Array], list[Array]]:
+    """The band of each lane from displacements to the left, L arrays (n, D): how far it reaches to the left and to the
+    right of the line, L arrays (n,) each [m].
+
+    Between the two edges lies the share `level` of the D draws at each point, half of the rest on either side."""
     left, right = [], []
-    for nodes, index in zip(lane_nodes(evidence, estimate), layout.where, strict=True):
-        across = nodes[:, 5:] @ apart[:, index].T  # (n, D)
+    for across in displacements:
         low, high = np.quantile(across, [0.5 - level / 2, 0.5 + level / 2], axis=1)
         left.append(high)
         right.append(-low)

@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from experiments.lanes import Lanes
 from experiments.scenarios import paths
+from experiments.scenarios.protocol import LINE_STEP
 from experiments.scenarios.scene import JunctionTruth, Scene
 from inference.posterior import Posterior
 from models.program import InputError
@@ -106,12 +107,8 @@ def band_coverage(lanes: Lanes, truth: JunctionTruth) -> float:
 
 def _offset(line: Floats, true: Floats) -> Floats:
     """How far to the left of each point of a line the true one runs, nan beyond its ends, (n,) [m]."""
-    heading = paths.headings(line)
-    apart = true[None] - line[:, None]  # (n, m, 2)
-    nearest = (apart**2).sum(-1).argmin(1)
-    gap = apart[np.arange(len(line)), nearest]
-    offset = -np.sin(heading) * gap[:, 0] + np.cos(heading) * gap[:, 1]
-    end = (nearest < DROPPED / 0.25) | (nearest > len(true) - 1 - DROPPED / 0.25)
+    offset, place = paths.beside(line, true)
+    end = (place < DROPPED / LINE_STEP) | (place > len(true) - 1 - DROPPED / LINE_STEP)
     return np.where(end, np.nan, offset)
 
 

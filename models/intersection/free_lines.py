@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.intersection.course_lines import edges
 from models.intersection.free_evidence import FreeEvidence
 from models.intersection.free_kernel import free_nodes
 
@@ -38,18 +39,19 @@ def centre_lines(evidence: FreeEvidence, latents: Mapping[str, Any]) -> list[Arr
     return [nodes[:, :2] + evidence.origin for nodes in lane_nodes(evidence, latents)]
 
 
+def lane_displacements(evidence: FreeEvidence, estimate: Mapping[str, Any], draws: Mapping[str, Array]) -> list[Array]:
+    """How far to the left of the estimate's centre lines the draws' lines lie, L arrays (n, D) [m].
+
+    draws  {site: (D, *event)}; displacements are linear in what separates a draw from the estimate"""
+    apart = pack(evidence, draws) - pack(evidence, estimate)
+    pairs = zip(lane_nodes(evidence, estimate), evidence.where, strict=True)
+    return [nodes[:, 5:] @ apart[:, where].T for nodes, where in pairs]
+
+
 def lane_bands(
     evidence: FreeEvidence, estimate: Mapping[str, Any], draws: Mapping[str, Array], level: float
 ) -> tuple[list[Array], list[Array]]:
     """How far left and right of the estimate's centre lines the draws' lines lie, L arrays (n,) each [m].
 
-    draws  {site: (D, *event)}, equally weighted; displacements are linear in what separates a draw from the
-    estimate. Between the two edges lies the share `level` of the draws at each point, half of the rest on either
-    side."""
-    apart, left, right = pack(evidence, draws) - pack(evidence, estimate), [], []
-    for nodes, where in zip(lane_nodes(evidence, estimate), evidence.where, strict=True):
-        across = nodes[:, 5:] @ apart[:, where].T  # (n, D)
-        low, high = np.quantile(across, [0.5 - level / 2, 0.5 + level / 2], axis=1)
-        left.append(high)
-        right.append(-low)
-    return left, right
+    draws  {site: (D, *event)}, equally weighted, see `lane_displacements`"""
+    return edges(lane_displacements(evidence, estimate, draws), level)

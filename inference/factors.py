@@ -47,7 +47,7 @@ def factored(model: Model, evidence: Any) -> Factors:
     def latents(x: Array) -> dict[str, Array]:
         flat = torch.from_numpy(np.ascontiguousarray(x).reshape(-1, bound.size))
         found = bound.latents(flat)
-        return {n: v.reshape(*x.shape[:-1], *bound.shapes[n]).detach().numpy() for n, v in found.items()}
+        return {n: v.reshape((*x.shape[:-1], *bound.shapes[n])).detach().numpy() for n, v in found.items()}
 
     def whiten(state: dict[str, Any]) -> Array:
         values: Latents = {n: torch.as_tensor(state[n], dtype=torch.float64) for n in bound.shapes}

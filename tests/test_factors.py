@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from inference.factors import factored
-from models.program import InputError, simulate
+from models.program import InputError, fix, simulate
 from models.toys.gaussian import ConjugateGaussian, Readings
 from models.toys.slot_road import Markings, SlotRoad
 from models.whitening import bind
@@ -40,6 +40,12 @@ def test_latents_and_whiten_are_inverse() -> None:
     beta = factors.latents(X)["beta"]
     assert beta == pytest.approx(X * np.array(MODEL.prior_std), rel=1e-12)
     assert factors.whiten({"beta": beta[3]}) == pytest.approx(X[3], rel=1e-12)
+
+
+def test_a_lone_scalar_has_the_shape_of_its_site() -> None:
+    readings = fix(SlotRoad(max_knots=1), num_knots=0, psi0=0.0, kappa0=0.0, knot=torch.ones(1), rate=torch.ones(1))
+    s = torch.linspace(0.0, 50.0, 4, dtype=torch.float64)
+    assert factored(readings, Markings(s, torch.zeros(4, dtype=torch.float64))).latents(np.zeros(1))["d0"].shape == ()
 
 
 def test_discrete_latents_are_refused_by_name() -> None:

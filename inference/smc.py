@@ -1,0 +1,139 @@
+"""Tempered sequential Monte Carlo: a population that is led from the prior to the posterior (Del Moral et al. 2006).
+
+Stage t raises the exponent b of what is tempered, h, as far as the weights of N particles bear (Jasra et al. 2011),
+
+    w_n = e^((b_t - b_(t-1)) h_n),   (sum w)^2 / sum w^2 = ess N,   log p(y) ~ sum_t log mean_n w_n
+
+resamples, and moves every particle by steps that leave p(z) e^(b_t h) as it is. h is the log likelihood: of whitened
+numbers that walk (a continuous model), or of states that make the model's reversible-jump moves (an unknown
+dimension: a population over structures). Whitened by a Laplace fit q, the path leads from q instead, h = log p / q.
+
+How far one run can be trusted is read from its families, the shares s_i of the final population that descend from
+each first particle: log p(y) has the standard error sqrt(sum s_i^2 - 1 / N), after Lee and Whiteley (2018), for
+resampling that is systematic.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from inference import weights
+from inference.factors import factored
+from inference.population import Movers, Population, Walkers
+from inference.posterior import Posterior, Snapshots
+from inference.progress import Progress
+from models.program import InputError, Model, log_joint
+
+Array = NDArray[Any]
+FEW = 20.0  # families below which a population has forgotten its beginnings
+
+
+def run(
+    model: Model,
+    evidence: Any,
+    *,
+    seed: int,
+    moves: Literal["auto", "walk", "model"] = "auto",
+    num_particles: int = 1000,
+    num_moves: int = 10,
+    ess: float = 0.5,
+    progress: bool = False,
+) -> Posterior:
+    """A population from p(z | y), all draws of equal weight, and the log evidence.
+
+    moves          "walk" in whitened numbers, or the "model"'s own; "auto" takes its own where its dimension is unknown
+    num_moves      steps of every particle in a stage; reversible jump needs many more than walks
+    ess            share of the particles that the weights of a stage are worth
+
+    Raises InputError by name for latents that cannot be whitened and for a model without moves where its own are
+    asked for."""
+    began = time.perf_counter()
+    _check(num_particles, num_moves, ess)
+    first, shared = np.random.SeedSequence(seed).spawn(2)
+    rng = np.random.default_rng(shared)
+    population = _population(model, evidence, moves, num_particles, num_moves, first)
+    exponents, log_evidence, families = [0.0], 0.0, np.arange(num_particles)
+    shots = [(0.0, population.best())]
+    with Progress("tempering", 100, progress) as bar:
+        while exponents[-1] < 1.0:
+            heat, left = population.heat, 1.0 - exponents[-1]
+            rise = weights.temper(heat, ess * num_particles, left)
+            exponents.append(1.0 if rise == left else exponents[-1] + rise)
+            log_evidence += weights.log_mean(rise * heat)
+            index = weights.systematic(rise * heat, num_particles, rng.random())
+            population.choose(index)
+            families = families[index]
+            population.move(exponents[-1])
+            shots.append((time.perf_counter() - began, population.best()))
+            bar.advance(round(100 * _share_done(exponents)) - bar.done)
+    shares = np.bincount(families) / num_particles
+    draws, dimension = population.draws(), getattr(model, "dimension", None)
+    num_families = float(1.0 / np.square(shares).sum())
+    return Posterior(
+        draws={n: v[None] for n, v in draws.items()},
+        log_evidence=log_evidence,
+        model_index=draws[dimension][None] if dimension else None,
+        estimate=shots[-1][1],
+        info={
+            "engine": "smc",
+            "seconds": time.perf_counter() - began,
+            "evaluations": population.evaluations,
+            "acceptance": population.acceptance,
+            "exponents": exponents,
+            "families": num_families,
+            "log_evidence_error": math.sqrt(max(1.0 / num_families - 1.0 / num_particles, 0.0)),
+            "flags": _flags(num_families, num_particles),
+        },
+        snapshots=_snapshots(model, evidence, shots),
+    )
+
+
+def _check(num_particles: int, num_moves: int, ess: float) -> None:
+    for name, value, least in (("num_particles", num_particles, 2), ("num_moves", num_moves, 1)):
+        if value < least:
+            raise InputError(f"{name} is {value}; smc needs {least} or more")
+    if not 0.0 < ess < 1.0:
+        raise InputError(f"ess is {ess}; choose a share between 0 and 1")
+
+
+def _population(
+    model: Any, evidence: Any, moves: str, num_particles: int, num_moves: int, seed: np.random.SeedSequence
+) -> Population:
+    if moves not in ("auto", "walk", "model"):
+        raise InputError(f"moves must be one of auto, walk, model, but is '{moves}'")
+    if moves == "model" and not hasattr(model, "moves"):
+        raise InputError(f"moves=model needs a model with moves(), but {type(model).__name__} has none; use moves=walk")
+    if moves == "model" or (moves == "auto" and hasattr(model, "moves") and getattr(model, "dimension", None)):
+        return Movers(model, evidence, num_particles, num_moves, seed)
+    factors = factored(model, evidence)
+    size = factors.depends.shape[1]
+    if num_particles < 2 * size:
+        raise InputError(f"num_particles is {num_particles}; a cloud of {size} numbers needs {2 * size} or more")
+    rng = np.random.default_rng(seed)
+    return Walkers(lambda u: factors.evaluate(u).sum(1), factors.latents, (num_particles, size), num_moves, rng)
+
+
+def _share_done(exponents: list[float]) -> float:
+    """Exponents grow about geometrically."""
+    return 1.0 if exponents[-1] == 1.0 else 1.0 - math.log(exponents[-1]) / math.log(exponents[1])
+
+
+def _flags(num_families: float, num_particles: int) -> list[str]:
+    if num_families >= min(FEW, 0.5 * num_particles):
+        return []
+    return [
+        f"the population descends from {num_families:.1f} of its {num_particles} first particles in effect: modes and "
+        "structures may be lost; raise num_particles or num_moves"
+    ]
+
+
+def _snapshots(model: Model, evidence: Any, shots: list[tuple[float, dict[str, Array]]]) -> Snapshots:
+    states = {n: np.stack([state[n] for _, state in shots]) for n in shots[0][1]}
+    heights = log_joint(model, {n: torch.as_tensor(v) for n, v in states.items()}, evidence)
+    return Snapshots(np.arange(len(shots)), np.array([seconds for seconds, _ in shots]), heights.numpy(), states)

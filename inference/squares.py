@@ -167,7 +167,7 @@ def run(
     numbers = path.state.x[:, None] + solve_triangular(factor, noise, trans="T", lower=True)
     times, costs, states = zip(*path.visited, strict=True)
     scales = {name: float(path.scale[part][0]) for name, part in squares.sites.items() if name in learn}
-    steps = len(states) - 1
+    steps, volume = len(states) - 1, 0.5 * len(x) * np.log(2 * np.pi) + squares.log_volume
     flag = f"not converged after {num_steps} steps; raise num_steps or start closer (init)"
     if steps < num_steps:
         left = f"{undamped_promise(path.state):.2g}"
@@ -188,7 +188,7 @@ def run(
         snapshots=Snapshots(
             np.arange(len(states)),
             np.array(times),
-            squares.log_const - np.array(costs) - 0.5 * len(x) * np.log(2 * np.pi) - np.log(path.scale).sum(),
+            squares.log_const - np.array(costs) - volume - np.log(path.scale).sum(),
             squares.unpack(np.stack(states)),
         ),
     )

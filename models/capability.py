@@ -19,8 +19,9 @@ the step and of its reverse in natural units [rad, m], and the Jacobian of the d
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -152,6 +153,7 @@ class Squares(NamedTuple):
     shapes      {site: shape of its event}
     evaluate    (z, hessian (D, D), gradient (D,)) -> cost; fills the Gauss-Newton model of the cost at z
     log_const   of the observations: log p(y | z) = log_const - cost(z)
+    correlated  {site: (mean, tril)} where the prior of a site is not diagonal: the site is mean + tril z
     """
 
     loc: np.ndarray
@@ -160,14 +162,24 @@ class Squares(NamedTuple):
     shapes: dict[str, tuple[int, ...]]
     evaluate: Callable[[np.ndarray, np.ndarray, np.ndarray], float]
     log_const: float
+    correlated: Mapping[str, tuple[np.ndarray, np.ndarray]] = MappingProxyType({})
 
     def unpack(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """(*batch, D) to {site: (*batch, *event)}."""
-        return {n: z[..., part].reshape(z.shape[:-1] + self.shapes[n]) for n, part in self.sites.items()}
+        latents = {n: z[..., part] for n, part in self.sites.items()}
+        latents |= {n: mean + latents[n] @ tril.T for n, (mean, tril) in self.correlated.items()}
+        return {n: v.reshape(z.shape[:-1] + self.shapes[n]) for n, v in latents.items()}
 
     def pack(self, latents: dict[str, Any]) -> np.ndarray:
         """{site: (*event)} to (D,)."""
-        return np.concatenate([np.asarray(latents[n], dtype=np.float64).reshape(-1) for n in self.sites])
+        z = {n: np.asarray(latents[n], dtype=np.float64).reshape(-1) for n in self.sites}
+        z |= {n: np.linalg.solve(tril, z[n] - mean) for n, (mean, tril) in self.correlated.items()}
+        return np.concatenate([z[n] for n in self.sites])
+
+    @property
+    def log_volume(self) -> float:
+        """log |d latents / dz|."""
+        return float(sum(np.log(np.diag(tril)).sum() for _, tril in self.correlated.values()))
 
 
 @runtime_checkable

@@ -1,0 +1,107 @@
+"""What one cue says of a course, in machine code: its log density and its residuals.
+
+At the sample of the course nearest to the cue, with direction t = (cos, sin), normal n and curvature k,
+
+    along = t . (p - f),   across = n . (p - f)
+
+`exact`: the cue may be anywhere along the course (a flat density), and across it is normal about its offset o,
+
+    lateral  = across - k along^2 / 2 - o          distance from the parabola through the sample
+    variance = m' Sigma m + spread^2               m the normal at the foot of the cue
+    turn     = wrap(direction of motion - heading - k along - pi of oncoming traffic)
+    p        = (1 - clutter) N(lateral; 0, variance) N(turn; 0, flow) + clutter / width / (2 pi)
+
+where clutter is anything that does not follow the road: a false detection, a side street, a vehicle changing lanes.
+
+`paper`, [T17] eq. 4 and 5: the error is the distance from the predicted point on the normal of the sample, and one less
+the correlation of the directions; both normal with variance sigma^2 / beta. There is no clutter.
+
+Residuals r_i and rows J_i are such that -weight sum_i r_i J_i is the gradient of the log density in the local numbers
+(along, across, heading, curvature, offset) and weight sum_i J_i J_i' its expected curvature; weight is the probability
+that the cue follows the road.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from models.clothoid_kernel import BEND, COS, HEADING, SIN, X, Y
+from models.intersection.wrap import wrap
+
+# columns of a cue
+PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER = range(11)
+WIDTH = 11  # SPREAD is a variance [m^2], PRECISION 1 / std [1/rad], the last two are log densities
+ROOT_HALF = math.sqrt(0.5)
+
+
+@nb.njit(error_model="numpy")
+def nearest_sample(cue, table, step):  # type: ignore[no-untyped-def]
+    """The sample (num, 6) whose normal comes nearest to the cue, by a walk from where the chord says it is."""
+    last = len(table) - 1
+    chord_x, chord_y = table[last, X] - table[0, X], table[last, Y] - table[0, Y]
+    share = ((cue[PX] - table[0, X]) * chord_x + (cue[PY] - table[0, Y]) * chord_y) / (chord_x**2 + chord_y**2)
+    k = int(min(max(share, 0.0), 1.0) * last + 0.5)
+    for _ in range(4):
+        along = (cue[PX] - table[k, X]) * table[k, COS] + (cue[PY] - table[k, Y]) * table[k, SIN]
+        new = min(max(k + math.floor(along / step + 0.5), 0), last)
+        if new == k:
+            break
+        k = new
+    return k
+
+
+@nb.njit(error_model="numpy")
+def exact_cue(cue, offset, sample, rows):  # type: ignore[no-untyped-def]
+    """(log density, weight) of a cue; its residuals (3,) and their rows (3, 5) into rows (3, 6)."""
+    c, s, bend = sample[COS], sample[SIN], sample[BEND]
+    dx, dy = cue[PX] - sample[X], cue[PY] - sample[Y]
+    along, across = dx * c + dy * s, dy * c - dx * s
+    q = bend * along
+    lateral = across - 0.5 * q * along - offset
+    mx, my, norm = -s - c * q, c - s * q, 1.0 / (1.0 + q * q)
+    sx, sy = cue[SXX] * mx + cue[SXY] * my, cue[SXY] * mx + cue[SYY] * my
+    variance = cue[SPREAD] + norm * (mx * sx + my * sy)
+    root = 1.0 / math.sqrt(variance)
+    e = lateral * root
+    turn = wrap(cue[FLOW] - sample[HEADING] - q - cue[TURN]) * cue[PRECISION]
+    log_density, weight = cue[CONSTANT] - 0.5 * math.log(variance) - 0.5 * (e * e + turn * turn), 1.0
+    if cue[CLUTTER] > -np.inf:
+        ahead = log_density - cue[CLUTTER]
+        odds = math.exp(-abs(ahead))
+        weight = (1.0 if ahead > 0.0 else odds) / (1.0 + odds)
+        log_density = max(log_density, cue[CLUTTER]) + math.log1p(odds)
+    swing = -2.0 * ROOT_HALF * norm * (my * sx - mx * sy) / variance  # d variance / d heading, over sqrt(2) variance
+    rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3] = e, -q * root, root, 0.0
+    rows[0, 4], rows[0, 5] = -0.5 * along * along * root, -root
+    rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3] = (1.0 - e * e) * ROOT_HALF, swing * norm * bend, 0.0, swing
+    rows[1, 4], rows[1, 5] = swing * norm * along, 0.0
+    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = turn, -bend * cue[PRECISION], 0.0, -cue[PRECISION]
+    rows[2, 4], rows[2, 5] = -along * cue[PRECISION], 0.0
+    return log_density, weight
+
+
+@nb.njit(error_model="numpy")
+def paper_cue(cue, offset, sample, rows):  # type: ignore[no-untyped-def]
+    """The same as printed."""
+    c, s = sample[COS], sample[SIN]
+    dx, dy = cue[PX] - sample[X], cue[PY] - sample[Y]
+    root = 1.0 / math.sqrt(cue[SPREAD])
+    along, lateral = (dx * c + dy * s) * root, (dy * c - dx * s - offset) * root
+    turn = cue[FLOW] - sample[HEADING] - cue[TURN]
+    anti = (1.0 - math.cos(turn)) * cue[PRECISION]
+    rows[:] = 0.0
+    rows[0, 0], rows[0, 1] = along, root
+    rows[1, 0], rows[1, 2], rows[1, 5] = lateral, root, -root
+    rows[2, 0], rows[2, 3] = anti, -math.sin(turn) * cue[PRECISION]
+    return cue[CONSTANT] + math.log(root) - 0.5 * (along * along + lateral * lateral + anti * anti), 1.0
+
+
+@nb.njit(error_model="numpy")
+def score_cue(paper, cue, offset, sample, rows):  # type: ignore[no-untyped-def]
+    """(log density, weight) and rows of one or the other."""
+    if paper:
+        return paper_cue(cue, offset, sample, rows)
+    return exact_cue(cue, offset, sample, rows)

@@ -1,0 +1,153 @@
+"""The course of a road as a clothoid, seen through cues that follow it, Trusheim, Condurache and Mertins [T17].
+
+    course ~ N(mean, covariance)         C = (x, y, heading) of start and end, [T17] eq. 1 and 3
+    offset_g ~ N(mu_g, std_g^2)          one for each kind and side of static cues, one for each vehicle
+    cues ~ CuesAlongRoad(course, offset) [T17] eq. 4 and 5, or ours
+
+`likelihood` chooses between two:
+
+    paper  as printed: N(errorPos; 0, sigma / sqrt(beta)) N(errorFlow; 0, sigma / sqrt(beta)), where errorPos is the
+           distance from the predicted point on the nearest of samples every `spacing` metres, errorFlow one less the
+           cosine between flow and tangent, sigma = std of the kind / sqrt(confidence). The last and errorFlow are ours:
+           the paper says "related to the specific confidences" and "anti-correlation".
+    exact  departs from it so that it is a density: residuals across the road, corrected to second order for the foot
+           between two samples, with the measured covariance propagated, and a mixture with clutter.
+
+Both take the prior's full covariance; the paper leaves it open. See models.road.cue_kernel for the equations.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import torch
+from numpy.typing import NDArray
+
+from models.capability import Factors, Squares
+from models.program import InputError
+from models.road.along_road import CuesAlongRoad, cue_arrays
+from models.road.cues import KINDS, CueKind, Cues
+from models.road.evidence import RoadEvidence, road_evidence
+from models.road.kernel import density_slopes, group_densities, normal_equations
+from models.road.prior import USUAL_ROADS, CoursePrior, course_moments
+
+Floats = NDArray[np.float64]
+START_DRAWS = 64  # of the prior that a start is the best of
+START_BLUR = 1.5  # [m] of spread in their comparison: with less, all draws are bad and the best of them says little
+
+
+@dataclass(frozen=True)
+class RoadCourse:
+    """Which likelihood, with what settings; kinds beside those of models.road.cues."""
+
+    likelihood: Literal["exact", "paper"] = "exact"
+    clutter: float = 0.05  # share of cues that do not follow the road; of `exact`
+    clutter_width: float = 30.0  # across the road, where clutter is [m]
+    beta_static: float = 1.0  # weights of the paper's likelihood
+    beta_vehicle: float = 1.0
+    beta_flow: float = 1.0
+    spacing: float = 4.0  # of the samples of the course, about [m]
+    prior: CoursePrior = USUAL_ROADS
+    extra_kinds: tuple[CueKind, ...] = ()  # new kinds of cues; those of a known name replace it
+
+    def __post_init__(self) -> None:
+        if self.likelihood not in ("exact", "paper"):
+            raise InputError(f"likelihood is '{self.likelihood}'; choose 'exact' or 'paper'")
+        if not 0 <= self.clutter < 1:
+            raise InputError(f"clutter is {self.clutter}; give a share in [0, 1)")
+        for name in ("clutter_width", "beta_static", "beta_vehicle", "beta_flow", "spacing"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or value <= 0:
+                raise InputError(f"{name} must be finite and positive, but is {value}")
+
+    def __call__(self, evidence: RoadEvidence) -> None:
+        mean, tril = (torch.from_numpy(v) for v in course_moments(self.prior))
+        loc, std = torch.from_numpy(evidence.offset_loc), torch.from_numpy(evidence.offset_std)
+        course = pyro.sample("course", dist.MultivariateNormal(mean, scale_tril=tril))
+        offset = pyro.sample("offset", dist.Normal(loc, std).to_event(1))
+        pyro.sample("cues", CuesAlongRoad(self, evidence, course, offset), obs=evidence.cues)
+
+    @property
+    def num_samples(self) -> int:
+        """Samples of a course, about `spacing` apart."""
+        return max(2, 1 + math.ceil(self.prior.length / self.spacing))
+
+    def prepare(self, cues: Cues) -> RoadEvidence:
+        """Evidence of this model. Raises InputError for cues that no course can be computed from."""
+        kinds = {kind.name: kind for kind in (*KINDS, *self.extra_kinds)}
+        return road_evidence(cues, tuple(kinds.values()))
+
+    def start(self, evidence: RoadEvidence) -> dict[str, Floats]:
+        """The best of some courses of the prior, all offsets in its middle, seen as through fog.
+
+        The posterior has modes where a row of cues is taken for the other side of a bend; descent from the prior's
+        middle alone ends in them."""
+        mean, tril = course_moments(self.prior)
+        x = np.zeros((START_DRAWS, 6 + len(evidence.offset_loc)))
+        x[1:, :6] = first_draws(START_DRAWS - 1)
+        fog = evidence._replace(spread=np.hypot(evidence.spread, START_BLUR))
+        heights = np.empty((len(x), len(evidence.offset_loc)))
+        group_densities(x, *self._kernel(fog), evidence.offset_loc, evidence.offset_std, heights)  # type: ignore[call-arg]
+        best = x[np.argmax(heights.sum(-1) - 0.5 * (x**2).sum(-1))]
+        return {"course": mean + tril @ best[:6], "offset": evidence.offset_loc.copy()}
+
+    def factors(self, evidence: RoadEvidence) -> Factors:
+        """One factor for each group of cues: it reads the course and its own offset."""
+        mean, tril = course_moments(self.prior)
+        loc, std = evidence.offset_loc, evidence.offset_std
+        arguments = (*self._kernel(evidence), loc, std)
+        num = len(loc)
+
+        def evaluate(x: Floats) -> Floats:
+            out = np.empty((len(x), num))
+            group_densities(np.ascontiguousarray(x), *arguments, out)  # type: ignore[call-arg]
+            return out
+
+        def gradient(x: Floats) -> tuple[Floats, Floats]:
+            height, slope = np.empty(len(x)), np.empty_like(x)
+            density_slopes(np.ascontiguousarray(x), *arguments, height, slope)  # type: ignore[call-arg]
+            return height, slope
+
+        def latents(x: Floats) -> dict[str, Floats]:
+            return {"course": mean + x[..., :6] @ tril.T, "offset": loc + std * x[..., 6:]}
+
+        def whiten(state: dict[str, Any]) -> Floats:
+            course, offset = (np.asarray(state[name], dtype=np.float64) for name in ("course", "offset"))
+            return np.concatenate([np.linalg.solve(tril, course - mean), (offset - loc) / std])
+
+        depends = np.hstack([np.ones((num, 6), dtype=bool), np.eye(num, dtype=bool)])
+        sites = {"course": slice(0, 6), "offset": slice(6, 6 + num)}
+        return Factors(evaluate, gradient, depends, sites, latents, whiten)
+
+    def squares(self, evidence: RoadEvidence) -> Squares:
+        """The same density for least squares. Clutter weighs residuals down; the gradient is exact all the same."""
+        num = len(evidence.offset_loc)
+        loc, scale = np.r_[np.zeros(6), evidence.offset_loc], np.r_[np.ones(6), evidence.offset_std]
+        sites = {"course": slice(0, 6), "offset": slice(6, 6 + num)}
+        evaluate = partial(_evaluate, self._kernel(evidence))
+        correlated = {"course": course_moments(self.prior)}
+        return Squares(loc, scale, sites, {"course": (6,), "offset": (num,)}, evaluate, 0.0, correlated=correlated)
+
+    def _kernel(self, evidence: RoadEvidence) -> tuple[Any, ...]:
+        """What every kernel reads of the model and its evidence."""
+        if evidence.cues is None:
+            raise InputError("this evidence has no cues (they await simulation); give them before inference")
+        settings = (*course_moments(self.prior), self.num_samples, self.likelihood == "paper")
+        return (*settings, *cue_arrays(self, evidence, evidence.cues.numpy()))
+
+
+def _evaluate(arguments: tuple[Any, ...], z: Floats, hessian: Floats, gradient: Floats) -> float:
+    return float(normal_equations(z, *arguments, hessian, gradient))  # type: ignore[call-arg]
+
+
+@functools.lru_cache
+def first_draws(num: int) -> Floats:
+    """Whitened courses (num, 6), the same every time."""
+    return np.random.default_rng(0).standard_normal((num, 6))

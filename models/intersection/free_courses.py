@@ -1,16 +1,21 @@
-"""The course of every lane as a curve of its own: no width, no straightness, no arms, turns of any sharpness.
+"""The course of every lane as a curve of its own: no width, no straightness, turns of any sharpness.
 
-A lane is a reference curve from its tracks (models.intersection.reference) and a displacement f(s) across it, a cubic
-B-spline with knots every few metres along the curve. Its curvature is a random walk from knot to knot, a P-spline with
-third differences (Eilers and Marx 1996) in the form of a mixed model:
+A lane is a reference curve from its tracks and a displacement f(s) across it, a cubic B-spline with knots every few
+metres along the curve: a P-spline with third differences (Eilers and Marx 1996) in the form of a mixed model, so that
+curvature is a random walk from knot to knot. Lanes that begin or end as one (the same arm, side and number in
+`connections`) share their spline there, as far in as the tracks show no difference; lanes of one arm share most of it.
+Sites, each one vector [m]:
 
-    place  (L, 3) how far beside the reference the parabola lies that third differences do not see, at the beginning,
-           the middle and the end of each lane [m]
-    jerk   (.,) third differences of controls, lane by lane: knots^2 times the change of curvature between knots [m]
+    offset     of every stub across the axis of its arm, from the middle of its tracks
+    arm_bow    slope and bow of every arm beside its axis; stub_bow what a stub has besides
+    arm_jerk   third differences of the spline of an arm: knots^2 times changes of curvature; stub_jerk of a stub
+    inner      the same of each lane between its stubs, whitened (models.intersection.free_splines)
 
-The middle of every jerk is minus that of the reference curve: the prior is about the course itself, wherever the
-reference lies. Learning the scale of `jerk` (inference.squares) is the choice of the smoothing parameter by
-marginal likelihood.
+The middle of every third difference is that of the reference: the prior is about the course itself, wherever the
+reference lies. Learning scales (inference.squares) is the choice of smoothing parameters by marginal likelihood; how
+rough lanes are compared with one another is chosen before, from the tracks of each alone.
+
+The structure is not read: a lane whose entry or exit arm is -1 has no stub there.
 """
 
 from __future__ import annotations
@@ -30,6 +35,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from models.capability import Squares
+from models.intersection.first_fit import Scales
 from models.intersection.free_evidence import FreeEvidence, free_evidence
 from models.intersection.free_kernel import free_equations
 from models.intersection.routes import RoutedTracks
@@ -42,15 +48,22 @@ Array = NDArray[np.float64]
 class FreeCourses:
     """Standard deviations of the priors and of the measurements."""
 
-    place_std: float = 1.0  # [m]
-    jerk_std: float = 0.3  # [m]
+    offset_std: float = 1.0  # [m]
+    arm_bow_std: float = 1.0  # [m]
+    stub_bow_std: float = 0.2  # [m]
+    arm_jerk_std: float = 0.1  # [m]
+    stub_jerk_std: float = 0.03  # [m]
+    inner_std: float = 0.3  # of a lane as rough as most [m]
     position_std: float = 1.0  # of a point, on each axis [m]
     heading_std: float = 0.1  # of a measured heading [rad]
     spacing: float = 1.0  # of the nodes [m]
     knots: float = 4.0  # from one to the next [m]
+    shared: bool = True  # whether lanes of an arm are, or each is estimated by itself
 
     def __post_init__(self) -> None:
         for field in fields(self):
+            if field.name == "shared":
+                continue
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"{field.name} must be finite and positive, but is {value}")
@@ -58,13 +71,15 @@ class FreeCourses:
     def __call__(self, evidence: FreeEvidence) -> None:
         latents = {}
         for name, middle in evidence.loc.items():
-            loc = torch.from_numpy(middle)
-            latents[name] = pyro.sample(name, dist.Normal(loc, getattr(self, f"{name}_std")).to_event(loc.dim()))
+            scale = getattr(self, f"{name}_std") * torch.from_numpy(evidence.scale[name])
+            latents[name] = pyro.sample(name, dist.Normal(torch.from_numpy(middle), scale).to_event(1))
         pyro.sample("points", PointsOnCurves(self, evidence, latents), obs=evidence.points)
 
     def prepare(self, routed: RoutedTracks) -> FreeEvidence:
         """Evidence of this model. Raises InputError where no track is on a route."""
-        return free_evidence(routed, self.spacing, self.knots, (self.place_std, self.jerk_std, self.position_std))
+        return free_evidence(
+            routed, self.spacing, self.knots, Scales(self.offset_std, self.inner_std, self.position_std), self.shared
+        )
 
     def start(self, evidence: FreeEvidence) -> dict[str, Array]:
         """The reference curves themselves."""
@@ -75,7 +90,7 @@ class FreeCourses:
         ends = np.cumsum([0, *(loc.size for loc in evidence.loc.values())])
         sites = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(evidence.loc)}
         loc = np.concatenate([value.reshape(-1) for value in evidence.loc.values()])
-        scale = np.concatenate([np.full(value.size, getattr(self, f"{n}_std")) for n, value in evidence.loc.items()])
+        scale = np.concatenate([getattr(self, f"{name}_std") * value for name, value in evidence.scale.items()])
         shapes = {name: value.shape for name, value in evidence.loc.items()}
         evaluate = partial(_evaluate, evidence_arrays(self, evidence))
         return Squares(loc, scale, sites, shapes, evaluate, log_constant(self, evidence))

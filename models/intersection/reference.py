@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from models.intersection.free_kernel import free_nodes
 from models.spline import ORDER, basis
 
 Array = NDArray[np.float64]
@@ -63,6 +64,26 @@ def direction(a: Array, b: Array) -> Array:
 def arc_length(line: Array) -> Array:
     """(n,) along the chords [m]."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def tangents(line: Array) -> Array:
+    """Unit tangents (n, 2) of a polyline by central differences."""
+    steps = np.gradient(line, axis=0)
+    return np.asarray(steps / np.linalg.norm(steps, axis=1)[:, None])
+
+
+def curvatures(line: Array) -> Array:
+    """(n,) of a polyline [1/m]."""
+    nodes = np.empty((len(line), 5))
+    free_nodes(np.empty(0), np.hstack([line, tangents(line)]), np.empty((len(line), 0)), nodes)
+    return nodes[:, 4]
+
+
+def turns(line: Array, t: Array, pieces: int, knots: float) -> Array:
+    """Third differences (pieces,) that take the changes of a curve's own curvature from knot to knot back [m].
+
+    t (n,) of the points (n, 2) of the curve; knots lie `knots` apart in t"""
+    return np.asarray(-(knots**2) * np.diff(np.interp(knots * np.arange(pieces + 1), t, curvatures(line))))
 
 
 def resampled(line: Array, spacing: float) -> Array:

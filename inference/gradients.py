@@ -31,7 +31,7 @@ Samples are rows: noise (S, D). `share` tempers the likelihood (inference.transf
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,7 @@ from inference.transform import Target
 Array = NDArray[np.float64]
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 TINY = 1e-300  # lets 0 / 0 be 0
+EVERY = slice(None)
 
 
 class Gaussian(NamedTuple):
@@ -76,11 +77,11 @@ class Reading(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Numbers that are drawn from a wider q together: rows of the samples, columns of u, and where F reads several of
-    them: coupled (n, n)."""
+    """Numbers that are drawn from a wider q together: rows of the samples, columns of u (a slice where they are
+    neighbours), and where F reads several of them: coupled (n, n)."""
 
     rows: slice
-    columns: NDArray[np.int64]
+    columns: Any
     coupled: Array
 
 
@@ -91,15 +92,20 @@ def reading(target: Target, rao_blackwell: bool) -> Reading:
     return Reading(factors, rao_blackwell, factors.T @ factors > 0.0)
 
 
-def signal(values: Array, noise: Array, log_sd: Array, reads: Reading) -> Array:
-    """F (S, D) from the factors of the target (S, K + D)."""
-    surprise = 0.5 * noise * noise
-    surprise += log_sd + HALF_LOG_2PI  # -log q_d
-    return values @ reads.factors + (surprise if reads.own else surprise.sum(1, keepdims=True))
+def signal(values: Array, noise: Array, log_sd: Array, reads: Reading, columns: Any = EVERY) -> Array:
+    """F (S, n) of some columns of u from the factors of the target (S, K + D) and noise (S, D)."""
+    own = columns if reads.own else EVERY
+    e = noise[:, own]
+    surprise = e * e
+    surprise *= 0.5
+    surprise += log_sd[own] + HALF_LOG_2PI  # -log q_d
+    if not reads.own:
+        surprise = surprise.sum(1, keepdims=True)
+    return values @ reads.factors[:, columns] + surprise
 
 
 def terms(strength: Array, noise: Array, weight: Array | None, control_variates: bool) -> Array:
-    """y (S, 2 n), whose means are the gradient by mean / sd and by log sd; strength F, noise and weight w (S, n)."""
+    """y (S, 2, n), whose means are the gradient by mean / sd and by log sd; strength F, noise and weight w (S, n)."""
     h = np.empty((len(noise), 2, noise.shape[1]))
     h[:, 0] = noise
     np.multiply(noise, noise, out=h[:, 1])
@@ -114,15 +120,15 @@ def terms(strength: Array, noise: Array, weight: Array | None, control_variates:
         product /= square + TINY
         product *= h
         y -= product
-    return y.reshape(len(noise), -1)
+    return y
 
 
 def score(target: Target, q: Gaussian, noise: Array, share: float, reads: Reading, control_variates: bool) -> Array:
     """Gradient by (mean, log sd), (2 D,)."""
     values = target.evaluate(q.draw(noise), share)
-    gradient = terms(signal(values, noise, q.log_sd, reads), noise, None, control_variates).mean(0)
-    gradient[: target.size] /= np.exp(q.log_sd)
-    return gradient
+    gradient = terms(signal(values, noise, q.log_sd, reads), noise, None, control_variates).sum(0) / len(noise)
+    gradient[0] /= np.exp(q.log_sd)
+    return gradient.reshape(-1)
 
 
 def blocks(sites: dict[str, slice], reads: Reading, num_samples: int) -> list[Block]:
@@ -139,11 +145,14 @@ def blocks(sites: dict[str, slice], reads: Reading, num_samples: int) -> list[Bl
         else:
             group.append(part)
     ends = [round(num_samples * i / len(groups)) for i in range(len(groups) + 1)]
-    columns = [np.concatenate([np.arange(part.start, part.stop) for part in g]) for g in groups]
-    return [
-        Block(slice(a, b), c, coupled[np.ix_(c, c)].astype(float))
-        for a, b, c in zip(ends[:-1], ends[1:], columns, strict=True)
-    ]
+    plan = []
+    for first, last, group in zip(ends[:-1], ends[1:], groups, strict=True):
+        columns: Any = np.concatenate([np.arange(part.start, part.stop) for part in group])
+        meet = coupled[np.ix_(columns, columns)].astype(float)
+        if (np.diff(columns) == 1).all():
+            columns = slice(int(columns[0]), int(columns[-1]) + 1)  # views are quicker
+        plan.append(Block(slice(first, last), columns, meet))
+    return plan
 
 
 def overdispersed(
@@ -163,22 +172,19 @@ def overdispersed(
     for block, factor in zip(plan, np.sqrt(tau), strict=True):
         wide[block.rows, block.columns] *= factor
     values = target.evaluate(q.draw(wide), share)
-    gradient, slopes = np.empty(2 * target.size), np.empty(len(plan))
+    gradient, slopes = np.empty((2, target.size)), np.empty(len(plan))
     for i, (rows, columns, coupled) in enumerate(plan):
-        strength = signal(values[rows], wide[rows], q.log_sd, reads)[:, columns]
-        square = noise[rows, columns]
-        square *= square
-        log_weight = 0.5 * (math.log(tau[i]) - (tau[i] - 1.0) * square)
-        y = terms(strength, wide[rows, columns], np.exp(log_weight @ coupled), control_variates)
-        mean = y.mean(0)
-        gradient[columns], gradient[target.size + columns] = mean[: len(columns)], mean[len(columns) :]
+        strength = signal(values[rows], wide[rows], q.log_sd, reads, columns)
+        square = np.square(noise[rows, columns])
+        log_weight = (0.5 * (math.log(tau[i]) - (tau[i] - 1.0) * square)) @ coupled
+        y = terms(strength, wide[rows, columns], np.exp(log_weight), control_variates)  # (S, 2, n)
+        gradient[:, columns] = y.sum(0) / len(y)
         y *= y
-        excess = 0.5 * ((square - 1.0) @ coupled)  # (S, n)
-        power = y.mean(0) + TINY
-        fall = np.einsum("sn,sn->n", y[:, : len(columns)], excess), np.einsum("sn,sn->n", y[:, len(columns) :], excess)
-        slopes[i] = -np.mean(np.concatenate(fall) / power) / len(y)
-    gradient[: target.size] /= np.exp(q.log_sd)
-    return gradient, slopes
+        power = y.sum(0) + TINY
+        y *= (0.5 * ((square - 1.0) @ coupled))[:, None]
+        slopes[i] = -np.mean(y.sum(0) / power)
+    gradient[0] /= np.exp(q.log_sd)
+    return gradient.reshape(-1), slopes
 
 
 def reparameterised(target: Target, q: Gaussian, noise: Array, share: float) -> Array:

@@ -210,7 +210,7 @@ def run(
     state = first_state(plan, found.start, fixed_scale or start_scale, tau)
     marks = set(np.linspace(0, num_steps, num_snapshots + 1).round().astype(int).tolist()) if num_snapshots else set()
     shots = [(0, time.perf_counter() - began, state.numbers)] if marks else []
-    with Progress("variational inference", num_steps, progress) as bar:
+    with np.errstate(invalid="ignore"), Progress("variational inference", num_steps, progress) as bar:
         while state.done < num_steps:
             state = step(plan, state, rng.standard_normal((num_samples, plan.target.size)))
             if state.done in marks:

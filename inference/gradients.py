@@ -35,7 +35,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from inference.transform import Target
 
@@ -194,6 +193,6 @@ def reparameterised(target: Target, q: Gaussian, noise: Array, share: float) -> 
     if q.lower is None:
         slope = slope + noise / sd
         return np.concatenate([slope.mean(0), sd * (slope * noise).mean(0)])
-    slope = slope + solve_triangular(q.lower + np.diag(sd), noise.T, trans="T", lower=True).T
+    slope = slope + noise @ np.linalg.inv(q.lower + np.diag(sd))
     outer = slope.T @ noise / len(noise)
     return np.concatenate([slope.mean(0), sd * outer.diagonal(), outer[np.tril_indices(target.size, -1)]])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from inference import diagnostics, least_squares, rjmcmc
+from inference import bbvi, diagnostics, least_squares, rjmcmc
 from inference.posterior import Posterior
 from models.program import simulate
 from models.toys.gaussian import ConjugateGaussian, Readings
@@ -22,6 +22,7 @@ BLANK = Readings(torch.linspace(-1.0, 1.0, 20, dtype=torch.float64), None)
 EVIDENCE = BLANK._replace(y=simulate(MODEL, BLANK, num=1, seed=3)["y"][0])
 
 ENGINES: dict[str, Callable[[], Posterior]] = {
+    "bbvi": lambda: bbvi.run(MODEL, EVIDENCE, seed=1, estimator="reparameterised", num_draws=4000),
     "least_squares": lambda: least_squares.run(MODEL, EVIDENCE, seed=1, num_draws=4000),
     "rjmcmc": lambda: rjmcmc.run(MODEL, EVIDENCE, seed=1, num_chains=20, num_steps=1500, warmup=300),
 }
@@ -63,9 +64,12 @@ def test_posterior_tells_what_it_cost(posterior: Posterior) -> None:
     assert posterior.info["seconds"] > 0
     assert posterior.snapshots is not None
     assert np.all(np.diff(posterior.snapshots.seconds) >= 0)
-    assert np.all(np.diff(posterior.snapshots.log_joint) > -1e-9)
+    wander = 0.01 if posterior.info.get("engine") == "bbvi" else 1e-9  # [nats]: the mean of q follows noisy gradients
+    assert np.all(np.diff(posterior.snapshots.log_joint) > -wander)
 
 
 def test_estimates_of_the_evidence_are_exact() -> None:
     _, _, log_evidence = MODEL.exact(EVIDENCE)
     assert ENGINES["least_squares"]().log_evidence == pytest.approx(float(log_evidence), abs=1e-8)
+    found = ENGINES["bbvi"]()
+    assert found.log_evidence == pytest.approx(float(log_evidence), abs=4 * found.info["elbo_error"])

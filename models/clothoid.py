@@ -28,8 +28,12 @@ from models.program import InputError
 
 T, W = torch.from_numpy(NODES), torch.from_numpy(WEIGHTS)
 BOW = T * T - T
+ANGLES = torch.stack((BOW, 1.0 - T, T))  # of bow, p and q
 DETACHED_STEPS = 3  # bring the bow within 3e-11 of the root, for any headings
 ATTACHED_STEPS = 2
+FEET = 64  # samples that a projection starts from
+FOOT_STEPS = 4
+NEAR_CENTRE = 0.05  # of the radius: nearer to the centre of the circle Newton's step would run away
 
 
 class Clothoid(NamedTuple):
@@ -75,8 +79,8 @@ def hermite_or_inf(start: Tensor, end: Tensor) -> Clothoid:
     usable = ends.isfinite().all(-1) & chord.isfinite() & (chord > MIN_CHORD)
     dx, dy = torch.where(usable, dx, 1.0), torch.where(usable, dy, 0.0)  # a gradient of nan would spread
     along = torch.atan2(dy, dx)
-    p = _wrap(torch.where(usable, ends[..., 2], 0.0) - along)
-    q = _wrap(torch.where(usable, ends[..., 5], 0.0) - along)
+    p = wrap_angle(torch.where(usable, ends[..., 2], 0.0) - along)
+    q = wrap_angle(torch.where(usable, ends[..., 5], 0.0) - along)
     bow = _newton(guess_bow.py_func(p, q).detach(), p.detach(), q.detach(), DETACHED_STEPS)
     bow = _newton(bow, p, q, ATTACHED_STEPS)
     shrink = torch.cos(_angles(bow, p, q)) @ W
@@ -120,12 +124,53 @@ def sample(clothoid: Clothoid, num: int) -> Points:
 
     Cumulative Simpson integration: quicker than `evaluate` and off by (turn per step)^4 / 2880 of the length at most,
     3e-7 m on roads at steps of 2 m."""
-    fine = clothoid.length[..., None] * torch.linspace(0.0, 1.0, 2 * num - 1, dtype=torch.float64)
-    heading, curvature = _direction(clothoid, fine)
+    u = torch.linspace(0.0, 1.0, 2 * num - 1, dtype=torch.float64)
+    bend, twist = clothoid.curvature * clothoid.length, clothoid.rate * clothoid.length**2
+    # products of small matrices: their one large result is the cheapest way to the headings
+    heading = torch.stack((clothoid.heading, bend, twist), -1) @ torch.stack((u**0, u, u * u / 2.0))
+    curvature = torch.stack((clothoid.curvature, clothoid.rate * clothoid.length), -1) @ torch.stack((u**0, u))[:, ::2]
     sixth = clothoid.length[..., None] / (6 * (num - 1))
-    x = clothoid.x[..., None] + _simpson(torch.cos(heading)) * sixth
-    y = clothoid.y[..., None] + _simpson(torch.sin(heading)) * sixth
-    return Points(x, y, heading[..., ::2], curvature[..., ::2])
+    x = _simpson(clothoid.x, torch.cos(heading), sixth)
+    return Points(x, _simpson(clothoid.y, torch.sin(heading), sixth), heading[..., ::2], curvature)
+
+
+def project(clothoid: Clothoid, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Arc length of the foot of points (*B, N, 2), and their offset to the left of it: (*B, N) each [m].
+
+    (point - foot) . tangent = 0, by Newton's steps from the nearest of FEET samples. Beyond its ends the clothoid goes
+    on straight: such points get an arc length below 0 or above `length`, and the offset from the tangent there. A point
+    as far off as the radius of the curve has no single foot, and near it one of several is found."""
+    coarse = sample(Clothoid(*(number.detach() for number in clothoid)), FEET)
+    px, py = points.detach().unbind(-1)
+    gap = (px[..., None] - coarse.x[..., None, :]) ** 2 + (py[..., None] - coarse.y[..., None, :]) ** 2
+    spacing = clothoid.length.detach()[..., None] / (FEET - 1)
+    arc = gap.argmin(-1) * spacing
+    with torch.no_grad():
+        for _ in range(FOOT_STEPS):
+            step, _ = foot_step(points, _continued(clothoid, arc))
+            arc = arc + step.clamp(-spacing, spacing)
+    arc = arc.detach()
+    for _ in range(ATTACHED_STEPS):
+        step, _ = foot_step(points, _continued(clothoid, arc))
+        arc = arc + step
+    return arc, foot_step(points, _continued(clothoid, arc))[1]
+
+
+def foot_step(points: Tensor, at: Points) -> tuple[Tensor, Tensor]:
+    """Newton's step along the line from `at` towards the feet of points (*B, N, 2), and their offset to the left of
+    the tangents there: (*B, N) each."""
+    dx, dy = points[..., 0] - at.x, points[..., 1] - at.y
+    cos, sin = torch.cos(at.heading), torch.sin(at.heading)
+    offset = dy * cos - dx * sin
+    return (dx * cos + dy * sin) / (1.0 - at.curvature * offset).clamp(min=NEAR_CENTRE), offset
+
+
+def _continued(clothoid: Clothoid, arc: Tensor) -> Points:
+    """Points at arc (*B, N) of the clothoid with straight lines at its ends."""
+    inside = arc.clamp(min=0.0).minimum(clothoid.length[..., None])
+    at, beyond = evaluate(clothoid, inside), arc - inside
+    x, y = at.x + beyond * torch.cos(at.heading), at.y + beyond * torch.sin(at.heading)
+    return Points(x, y, at.heading, torch.where(beyond == 0.0, at.curvature, 0.0))
 
 
 def _direction(clothoid: Clothoid, arc: Tensor) -> tuple[Tensor, Tensor]:
@@ -134,20 +179,22 @@ def _direction(clothoid: Clothoid, arc: Tensor) -> tuple[Tensor, Tensor]:
     return clothoid.heading[..., None] + arc * (curvature + 0.5 * turn), curvature + turn
 
 
-def _simpson(values: Tensor) -> Tensor:
-    """Integrals from the first of (..., 2 n + 1) values to every other one, in sixths of their step: (..., n + 1)."""
-    steps = values[..., :-1:2] + 4.0 * values[..., 1::2] + values[..., 2::2]
-    return torch.nn.functional.pad(steps.cumsum(-1), (1, 0))
+def _simpson(first: Tensor, slopes: Tensor, sixth: Tensor) -> Tensor:
+    """What grows from `first` (*B) with slopes (*B, 2 n + 1), at every other of them: (*B, n + 1).
+
+    sixth  a sixth of the distance from one to the next but one, (*B, 1)"""
+    steps = (torch.add(slopes[..., :-1:2], slopes[..., 1::2], alpha=4.0) + slopes[..., 2::2]) * sixth
+    return torch.cat((first[..., None], steps), -1).cumsum(-1)
 
 
-def _wrap(angle: Tensor) -> Tensor:
+def wrap_angle(angle: Tensor) -> Tensor:
     """An angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * torch.floor(angle / (2.0 * math.pi) + 0.5)
 
 
 def _angles(bow: Tensor, p: Tensor, q: Tensor) -> Tensor:
     """angle(t) at the nodes, (*B, nodes)."""
-    return bow[..., None] * BOW + (q - p)[..., None] * T + p[..., None]
+    return torch.stack((bow, p, q), -1) @ ANGLES
 
 
 def _newton(bow: Tensor, p: Tensor, q: Tensor, steps: int) -> Tensor:

@@ -19,6 +19,7 @@ Both take the prior's full covariance; the paper leaves it open. See models.road
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -29,18 +30,20 @@ import pyro
 import pyro.distributions as dist
 import torch
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from models.capability import Factors, Squares
 from models.program import InputError
 from models.road.along_road import CuesAlongRoad, cue_arrays
+from models.road.cue_kernel import SPREAD
 from models.road.cues import KINDS, CueKind, Cues
 from models.road.evidence import RoadEvidence, road_evidence
 from models.road.kernel import density_slopes, group_densities, normal_equations
 from models.road.prior import USUAL_ROADS, CoursePrior, course_moments
 
 Floats = NDArray[np.float64]
-START_DRAWS = 64  # of the prior that a start is the best of
-START_BLUR = 1.5  # [m] of spread in their comparison: with less, all draws are bad and the best of them says little
+FIRST_ROADS = (16, 4)  # places and directions of the end that a start is the best of
+FOGS = (3.0, 1.0, 0.4)  # [m]
 
 
 @dataclass(frozen=True)
@@ -85,18 +88,26 @@ class RoadCourse:
         return road_evidence(cues, tuple(kinds.values()))
 
     def start(self, evidence: RoadEvidence) -> dict[str, Floats]:
-        """The best of some courses of the prior, all offsets in its middle, seen as through fog.
+        """The best of some roads of the prior, improved by a Gauss-Newton step each as the fog lifts.
 
-        The posterior has modes where a row of cues is taken for the other side of a bend; descent from the prior's
-        middle alone ends in them."""
-        mean, tril = course_moments(self.prior)
-        x = np.zeros((START_DRAWS, 6 + len(evidence.offset_loc)))
-        x[1:, :6] = first_draws(START_DRAWS - 1)
-        fog = evidence._replace(spread=np.hypot(evidence.spread, START_BLUR))
-        heights = np.empty((len(x), len(evidence.offset_loc)))
-        group_densities(x, *self._kernel(fog), evidence.offset_loc, evidence.offset_std, heights)  # type: ignore[call-arg]
-        best = x[np.argmax(heights.sum(-1) - 0.5 * (x**2).sum(-1))]
-        return {"course": mean + tril @ best[:6], "offset": evidence.offset_loc.copy()}
+        The posterior has modes where rows of cues are taken for clutter or for the other side of a bend, and descent
+        from the prior's middle often ends in them. Fog is spread added to that of the cues (`FOGS`)."""
+        loc, std = evidence.offset_loc, evidence.offset_std
+        mean, tril, num, paper, cues, group = self._kernel(evidence)
+        centre, scale = np.r_[np.zeros(6), loc], np.r_[np.ones(6), std]
+        x, sharp = first_roads(len(loc)), cues[:, SPREAD].copy()
+        cues[:, SPREAD] = sharp + FOGS[0] ** 2
+        heights = np.empty((len(x), len(loc)))
+        group_densities(x, mean, tril, num, paper, cues, group, loc, std, heights)  # type: ignore[call-arg]
+        best = x[np.argmax(heights.sum(-1))]
+        hessian, gradient = np.empty((len(best), len(best))), np.empty(len(best))
+        for fog in FOGS:
+            cues[:, SPREAD] = sharp + fog**2
+            z = centre + scale * best
+            normal_equations(z, mean, tril, num, paper, cues, group, hessian, gradient)  # type: ignore[call-arg]
+            whole = np.eye(len(best)) + scale[:, None] * hessian * scale
+            best = best - np.linalg.solve(whole, best + scale * gradient)
+        return {"course": mean + tril @ best[:6], "offset": loc + std * best[6:]}
 
     def factors(self, evidence: RoadEvidence) -> Factors:
         """One factor for each group of cues: it reads the course and its own offset."""
@@ -148,6 +159,9 @@ def _evaluate(arguments: tuple[Any, ...], z: Floats, hessian: Floats, gradient: 
 
 
 @functools.lru_cache
-def first_draws(num: int) -> Floats:
-    """Whitened courses (num, 6), the same every time."""
-    return np.random.default_rng(0).standard_normal((num, 6))
+def first_roads(num_groups: int) -> Floats:
+    """Whitened numbers (S, 6 + G) of roads that end at evenly probable places, in evenly probable directions there."""
+    ends = [ndtri((np.arange(num) + 0.5) / num) for num in FIRST_ROADS]
+    x = np.zeros((math.prod(FIRST_ROADS), 6 + num_groups))
+    x[:, 4:6] = list(itertools.product(*ends))
+    return x

@@ -20,7 +20,8 @@ from benchmarks.lane_bound import lane_bound
 from benchmarks.lane_papers import m19_refine, m20_refine
 from experiments.junction_metrics import structure
 from experiments.lane_metrics import COST, band_coverage, lane_error
-from experiments.lanes import BAND, Lanes, refine_lanes, whole_structure
+from experiments.lane_posterior import Lanes
+from experiments.lanes import BAND, refine_lanes, whole_structure
 from experiments.scenarios.junction import junction, names
 from experiments.scenarios.protocol import protocol
 from experiments.scenarios.scene import Scene
@@ -160,7 +161,7 @@ def papers(effort: Effort) -> Values:
         for seed in range(effort.few):
             scene = protocol(seed)
             trial = refine(default(), scene, seed)
-            structure = whole_structure(default().structure.model, trial.found)
+            structure = whole_structure(default().structure.model, trial.found.estimate)
             routed = RoutedTracks(scene.data, structure, trial.lanes.routes)
             for name, result in (("m20", m20_refine(routed)), ("m19", m19_refine(routed, seed))):
                 lanes[name].append((lane_error(result[0], scene.truth)["lane_error_cm"], result[1]))

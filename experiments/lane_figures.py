@@ -10,13 +10,16 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from experiments.junction_figures import INK, TRACK, TRUE_LINE
-from experiments.lanes import LanePosterior
+from experiments.lane_posterior import LanePosterior
 from experiments.scenarios.scene import Scene
 from inference.posterior import Posterior
 
 Floats = NDArray[np.float64]
 BEFORE, AFTER, BAND = "#9aa3ab", "#c2452d", "#e8a798"
+OTHER, FAINTEST = "#7b3f9e", 0.15
+SURE = 0.95  # probability of a lane above which it is called sure
 ZOOM = 26.0  # half the side of the detailed view [m]
+_ALTERNATIVE = Line2D([], [], color=OTHER, ls=":", lw=1.6, label="lanes of other readings")
 
 
 def figures(posterior: Posterior, scene: Scene) -> dict[str, Figure]:
@@ -27,7 +30,8 @@ def figures(posterior: Posterior, scene: Scene) -> dict[str, Figure]:
 
 
 def sure_lanes(posterior: LanePosterior, scene: Scene) -> Figure:
-    """Centre lines over the tracks, coloured by half the width of the 90 % band."""
+    """Centre lines over the tracks, coloured by half the width of the 90 % band; dotted, fainter the less probable, the
+    lanes of other readings."""
     lanes = posterior.lanes
     assert lanes is not None
     pieces, half = [], []
@@ -42,9 +46,13 @@ def sure_lanes(posterior: LanePosterior, scene: Scene) -> Figure:
     drawn = LineCollection(list(np.concatenate(pieces)), array=values, cmap="viridis_r", lw=2.2, zorder=3)
     drawn.set_clim(0.0, float(np.quantile(values, 0.98)))
     axes.add_collection(drawn)
+    _alternatives(axes, posterior)
     figure.colorbar(drawn, ax=axes, shrink=0.7, label="90 % band: this far to either side [cm]")
     _dress(axes)
-    axes.set_title(f"{scene.name}: {len(lanes.lines)} lanes", loc="left", color=INK, fontsize=11)
+    sure = "" if posterior.probability is None else f", {(posterior.probability > SURE).sum()} of them sure"
+    axes.set_title(f"{scene.name}: {len(lanes.lines)} lanes{sure}", loc="left", color=INK, fontsize=11)
+    if posterior.alternatives:
+        axes.legend(handles=[_ALTERNATIVE], loc="upper right", frameon=False, fontsize=9)
     return figure
 
 
@@ -59,6 +67,7 @@ def before_and_after(posterior: LanePosterior, scene: Scene) -> Figure:
         if title == "structure alone":
             axes.add_collection(LineCollection(first, color=BEFORE, lw=1.6, zorder=3))
         else:
+            _alternatives(axes, posterior)
             for line, left, right in zip(lanes.lines, lanes.left, lanes.right, strict=True):
                 axes.fill(*_strip(line, left, right).T, color=BAND, lw=0, zorder=3)
             axes.add_collection(LineCollection(lanes.lines, color=AFTER, lw=0.8, zorder=4))
@@ -70,8 +79,16 @@ def before_and_after(posterior: LanePosterior, scene: Scene) -> Figure:
     handles = [Line2D([], [], color=BEFORE, label="before"), Line2D([], [], color=AFTER, label="after")]
     if scene.truth is not None:
         handles.append(Line2D([], [], **TRUE_LINE, label="true centre lines"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    if posterior.alternatives:
+        handles.append(_ALTERNATIVE)
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
+
+
+def _alternatives(axes: Axes, posterior: LanePosterior) -> None:
+    """Lanes of other readings, as opaque as they are probable."""
+    for other in posterior.alternatives:
+        axes.plot(*other.line.T, color=OTHER, ls=":", lw=1.6, alpha=max(other.probability, FAINTEST), zorder=3)
 
 
 def _strip(line: Floats, left: Floats, right: Floats) -> Floats:

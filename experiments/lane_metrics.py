@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from experiments.lanes import Lanes
+from experiments.lane_posterior import Lanes
 from experiments.scenarios import paths
 from experiments.scenarios.protocol import LINE_STEP
 from experiments.scenarios.scene import JunctionTruth, Scene

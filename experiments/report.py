@@ -45,14 +45,14 @@ def write_report(
     folder: Path,
     title: str,
     result: Result,
-    arms: list[dict[str, float]],
+    tables: dict[str, list[dict[str, float]]],
     images: dict[str, str],
     failures: dict[str, Exception],
     manifest: dict[str, Any],
 ) -> None:
     """Write report.html, which embeds its images (save_figures) and needs nothing else.
 
-    arms  of the estimate, where it is a junction (junction_metrics.arms)"""
+    tables  {heading: rows}; those without rows are left out"""
     info = result.posterior.info
     unscored = "<p>none: the truth of this scene is unknown</p>" if result.scene.truth is None else "<p>none</p>"
     body = [
@@ -60,7 +60,11 @@ def write_report(
         f'<p class="sub">scene {escape(result.scene.name)} &middot; {escape(manifest["date"])}</p>',
         _failures(failures),
         _flags(result.flags),
-        f"<h2>Arms found</h2>{table(tuple(map(head, arms[0])), [tuple(a.values()) for a in arms])}" if arms else "",
+        "".join(
+            f"<h2>{escape(title)}</h2>{table(tuple(map(head, rows[0])), [tuple(row.values()) for row in rows])}"
+            for title, rows in tables.items()
+            if rows
+        ),
         "<h2>Scores</h2>",
         _scores(result.scores, manifest["config"].get("metrics", [])) if result.scores else unscored,
         "".join(f"<h2>{_words(name)}</h2>{image}" for name, image in images.items()),

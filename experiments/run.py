@@ -223,6 +223,7 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
 def write(job: Job, result: Result) -> dict[str, Exception]:
     """Store a result in the folder of its job; all failures, those of writing figures and report included."""
     from experiments.junction_metrics import arms
+    from experiments.lane_posterior import LanePosterior
     from experiments.report import save_figures, write_report
 
     seeds = {"run": job.config["seed"], "engine": engine_seed(job.config["seed"])}
@@ -237,7 +238,9 @@ def write(job: Job, result: Result) -> dict[str, Exception]:
             found = arms(result.posterior.estimate)
             if found:
                 store.write_rows(folder / "arms.csv", found)
-            write_report(folder, job.name, result, found, images, failures, manifest)
+            lanes = result.posterior.table() if isinstance(result.posterior, LanePosterior) else []
+            tables = {"Arms found": found, "Lanes found": lanes}
+            write_report(folder, job.name, result, tables, images, failures, manifest)
         except Exception as error:
             failures["report"] = error
         store.write_json(folder / "manifest.json", manifest | {"failures": in_short(failures)})

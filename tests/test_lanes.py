@@ -17,9 +17,11 @@ from scipy.spatial import cKDTree
 
 import experiments.command  # noqa: F401  (installs the schemas)
 from experiments.lane_figures import figures
-from experiments.lanes import LanePosterior, estimate
+from experiments.lane_posterior import LanePosterior
+from experiments.lanes import estimate
 from experiments.scenarios.paths import resample
 from experiments.scenarios.protocol import protocol
+from experiments.store import read_rows
 from inference import least_squares, rjmcmc
 from inference.posterior import Posterior
 from models.intersection.courses import LaneCourses
@@ -85,7 +87,13 @@ def test_the_file_is_read_without_pickle(posterior: LanePosterior, tmp_path: Pat
     assert lanes is not None
     with np.load(tmp_path / "lanes.npz", allow_pickle=False) as file:
         stored = dict(file)
-    assert len(stored) == len(lanes.lines) + 2
+    assert posterior.probability is not None
+    num = len(lanes.lines) + len(posterior.alternatives)
+    assert len(stored) == num + 4
+    np.testing.assert_array_equal(stored["probability"], posterior.probability)
+    rows = read_rows(tmp_path / "lanes.csv")
+    assert [float(row["probability"]) for row in rows[: len(lanes.lines)]] == posterior.probability.tolist()
+    assert len(rows) == num
     for i, line in enumerate(lanes.lines):
         np.testing.assert_array_equal(stored[f"lane_{i}"], np.column_stack([line, lanes.left[i], lanes.right[i]]))
     np.testing.assert_array_equal(stored["connections"], lanes.routes.connections)

@@ -7,17 +7,19 @@ its stub where its course, averaged over WINDOW metres, is more than APART besid
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from models.intersection.reference import arc_length, curvatures, direction, tangents
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 WINDOW = 9  # [m]
-APART = 0.6  # [m]
+APART = 0.3  # [m]
 ASLANT = 0.15  # slope of a lane to the axis where it still runs along it
 BENT = 0.03  # curvature of an axis that is still an arm's [1/m]
 
@@ -57,15 +59,15 @@ def profile(inwards: Array, axis: Array) -> Profile:
     along = arc_length(axis)[nearest] + (gap * tangent).sum(1)
     across = tangent[:, 0] * gap[:, 1] - tangent[:, 1] * gap[:, 0]
     num = len(inwards) // 2  # the other half belongs to the other end
-    rise = np.convolve(np.diff(across), np.ones(WINDOW), "same")
-    run = np.convolve(np.diff(along), np.ones(WINDOW), "same")
-    astray = (np.abs(rise) > ASLANT * run) | (np.diff(along) <= 0.0)
-    astray |= (np.abs(curvatures(axis)) > BENT)[nearest[:-1]]
+    rise, run = (uniform_filter1d(np.diff(values), WINDOW) for values in (across, along))
+    astray = (np.abs(rise) > ASLANT * run) | (np.abs(curvatures(axis)) > BENT)[nearest[:-1]]
+    astray[:WINDOW] = False  # ends of curves are loose
+    astray |= np.diff(along) <= 0.0
     end = int(np.append(np.flatnonzero(astray[:num]), num)[0])
     return Profile(inwards, along[: end + 1], across[: end + 1])
 
 
-def together(profiles: list[Profile], weights: Array) -> Array:
+def together(profiles: list[Profile], weights: Array, position_std: float) -> Array:
     """(P,) how far in along the axis each lane of one stub shares its course with the others [m].
 
     weights  (P,) numbers of tracks
@@ -81,8 +83,10 @@ def together(profiles: list[Profile], weights: Array) -> Array:
     for i in range(len(table)):
         for j in range(len(table)):
             apart = np.nan_to_num(table[i] - table[j])
-            far = np.flatnonzero(np.abs(np.convolve(apart, np.ones(WINDOW) / WINDOW, "same")) > APART)
-            leaves[i, j] = min(leaves[i, j], grid[far[0]]) if len(far) else leaves[i, j]
+            noise = position_std * math.sqrt((1.0 / weights[i] + 1.0 / weights[j]) / WINDOW)
+            far = np.abs(uniform_filter1d(apart, WINDOW)) > APART + 2.0 * noise
+            far &= grid >= max(profiles[i].along[0], profiles[j].along[0]) + WINDOW
+            leaves[i, j] = min(leaves[i, j], grid[far.argmax()]) if far.any() else leaves[i, j]
     np.fill_diagonal(leaves, 0.0)
     leader = int((leaves @ weights).argmax())
     out = leaves[:, leader]

@@ -77,7 +77,7 @@ def free_evidence(routed: RoutedTracks, spacing: float, knots: float, scales: Sc
         lines.append(line)
         stds.append(std)
     ends = connections if shared else np.full_like(connections, -1)
-    stubs = find_stubs(lines, ends, np.diff(starts).astype(np.float64), knots, spacing)
+    stubs = find_stubs(lines, ends, np.diff(starts).astype(np.float64), knots, spacing, scales.position)
     shapes = [shape(line, pair, stubs, knots, spacing) for line, pair in zip(lines, stubs.sides, strict=True)]
     loc, scale, lanes = numbers(shapes, stubs, knots, scales.inner / scales.offset, np.array(stds) / scales.inner)
     pairs = list(zip(shapes, lanes, strict=True))

@@ -48,7 +48,7 @@ def shape(line: Array, pair: tuple[Side, Side], stubs: Stubs, knots: float, spac
             past = own - first if end == 0 else last - own
             beyond = beside(stubs, side.stub, leaves + past)
             course += _fade(past / BLEND)[:, None] * (beyond - course)
-            outer = np.arange(math.ceil(side.begins / spacing) * spacing, leaves - 0.5 * spacing, spacing)
+            outer = np.arange(math.ceil(side.begins / spacing - 1e-6) * spacing, leaves - 0.5 * spacing, spacing)
             points = beside(stubs, side.stub, outer)
             nodes = [points, *nodes] if end == 0 else [*nodes, points[::-1]]
             times = [outer, *times] if end == 0 else [*times, total - outer[::-1]]

@@ -53,7 +53,9 @@ class Stubs(NamedTuple):
     axes: list[Array]
 
 
-def find_stubs(lines: list[Array], connections: Ints, weights: Array, knots: float, spacing: float) -> Stubs:
+def find_stubs(
+    lines: list[Array], connections: Ints, weights: Array, knots: float, spacing: float, position_std: float
+) -> Stubs:
     """Stubs of lanes with first courses `lines`, each (n, 2), by the arms and lanes of their `connections` (L, 4).
 
     weights  (L,) numbers of tracks. An arm of -1 has no stub."""
@@ -67,7 +69,7 @@ def find_stubs(lines: list[Array], connections: Ints, weights: Array, knots: flo
         for key in sorted({(end, int(connections[lane, 2 * end + 1])) for lane, end in ends}):
             members = [lane for lane, end in ends if (end, connections[lane, 2 * end + 1]) == key]
             profiles = [profile(lines[lane][:: 1 - 2 * key[0]], axis) for lane in members]
-            shares = together(profiles, weights[members])
+            shares = together(profiles, weights[members], position_std)
             found = [_side(len(stubs), *pair, knots) for pair in zip(profiles, shares, strict=True)]
             if any(side.pieces for side in found):
                 across = [p.across[p.along <= s.pieces * knots] for p, s in zip(profiles, found, strict=True)]

@@ -25,6 +25,7 @@ GUESS_LAST = -0.045854475238709
 _x, _w = np.polynomial.legendre.leggauss(16)
 NODES, WEIGHTS = (_x + 1.0) / 2.0, _w / 2.0  # Gauss-Legendre on [0, 1]
 NEWTON_STEPS = 6  # at most; the fifth changes nothing for any headings
+ANCHOR = 16
 SETTLED = 1e-9  # [rad]; the step squares the error
 
 
@@ -70,20 +71,28 @@ def hermite_one(x0, y0, heading0, x1, y1, heading1, out):  # type: ignore[no-unt
 @nb.njit(error_model="numpy")
 def sample_one(clothoid, table):  # type: ignore[no-untyped-def]
     """Samples at equal steps of arc length, both ends included, into table (num, 6): x, y, heading, its cosine and
-    sine, curvature. clothoid (6,) as hermite_one fills it, of finite length; returns the step [m]."""
-    last = len(table) - 1
-    step, heading0, curvature, rate = clothoid[LENGTH] / last, clothoid[HEADING], clothoid[CURVATURE], clothoid[RATE]
-    x, y, cos, sin = clothoid[X], clothoid[Y], math.cos(heading0), math.sin(heading0)
-    heading = heading0
+    sine, curvature. clothoid (6,) as hermite_one fills it, of finite length; returns the step [m].
+
+    From half step to half step the direction is rotated by a turn that is itself rotated by rate step^2 / 4: much
+    cheaper than cosines. Every ANCHOR samples it is computed anew, before rounding adds up."""
+    step, heading0 = clothoid[LENGTH] / (len(table) - 1), clothoid[HEADING]
+    curvature, rate = clothoid[CURVATURE], clothoid[RATE]
+    x, y, half = clothoid[X], clothoid[Y], 0.5 * step
+    cos = sin = turn_cos = turn_sin = 0.0
+    more_cos, more_sin = math.cos(rate * half * half), math.sin(rate * half * half)
     for k in range(len(table)):
         s = k * step
+        heading, bend = heading0 + s * (curvature + 0.5 * rate * s), curvature + rate * s
+        if k % ANCHOR == 0:
+            turn = half * (bend + 0.5 * rate * half)
+            cos, sin, turn_cos, turn_sin = math.cos(heading), math.sin(heading), math.cos(turn), math.sin(turn)
         table[k, X], table[k, Y], table[k, HEADING] = x, y, heading
-        table[k, COS], table[k, SIN], table[k, BEND] = cos, sin, curvature + rate * s
-        middle, s = s + 0.5 * step, s + step
-        between = heading0 + middle * (curvature + 0.5 * rate * middle)
-        heading = heading0 + s * (curvature + 0.5 * rate * s)
-        cos1, sin1 = math.cos(heading), math.sin(heading)
-        x += step / 6.0 * (cos + 4.0 * math.cos(between) + cos1)
-        y += step / 6.0 * (sin + 4.0 * math.sin(between) + sin1)
-        cos, sin = cos1, sin1
+        table[k, COS], table[k, SIN], table[k, BEND] = cos, sin, bend
+        sum_cos, sum_sin = cos, sin
+        for weight in (4.0, 1.0):
+            cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
+            turn_cos, turn_sin = turn_cos * more_cos - turn_sin * more_sin, turn_sin * more_cos + turn_cos * more_sin
+            sum_cos, sum_sin = sum_cos + weight * cos, sum_sin + weight * sin
+        x += step / 6.0 * sum_cos
+        y += step / 6.0 * sum_sin
     return step

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 
@@ -11,6 +12,8 @@ import torch
 from scipy.special import fresnel
 from torch import Tensor
 
+from benchmarks import clothoid as benchmark
+from benchmarks.timing import THREADS
 from models.clothoid import FEET, Clothoid, evaluate, hermite, hermite_or_inf, project, sample
 from models.clothoid_kernel import MAX_STRETCH
 from models.program import InputError
@@ -266,3 +269,14 @@ def test_batches_of_any_shape_are_what_their_members_are() -> None:
     one = hermite(start[4], end[4])
     assert found.length[1, 1] == pytest.approx(float(one.length), rel=1e-14)
     torch.testing.assert_close(project(one, points[1, 1])[1], offset[1, 1], rtol=1e-12, atol=1e-12)
+
+
+def test_the_benchmark_reports_its_figures(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pyclothoids", reason="the extra 'peers' is not installed")
+    for name in THREADS:  # the command pins them: give the other tests theirs back
+        monkeypatch.setenv(name, "1")
+    monkeypatch.setattr(benchmark, "BATCH", 20)
+    monkeypatch.setattr(benchmark, "REPEATS", 1)
+    assert benchmark.main(["--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert all(found[key] > 0.0 for key in ("g1_us_batch", "pyclothoids_us", "g1_ratio", "sample_ratio"))

@@ -110,10 +110,10 @@ def cue_arrays(model: RoadCourse, evidence: RoadEvidence, cues: Floats) -> tuple
     rows[:, 3], rows[:, 4], rows[:, 5] = (evidence.covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     rows[:, 6], rows[:, 7], rows[:, 8] = evidence.spread**2 / position, precision, evidence.turn
     constant = np.where(measured, np.log(np.where(measured, precision, 1.0)) - 0.5 * math.log(2 * math.pi), 0.0)
-    rows[:, 9], rows[:, 10] = constant - 0.5 * math.log(2 * math.pi), -np.inf
+    rows[:, 9], rows[:, 10] = constant - 0.5 * math.log(2 * math.pi), 0.0
     if not paper and model.clutter > 0:
         rows[:, 9] += math.log1p(-model.clutter)
-        rows[:, 10] = math.log(model.clutter / model.clutter_width) - np.where(measured, math.log(2 * math.pi), 0.0)
+        rows[:, 10] = model.clutter / model.clutter_width / np.where(measured, 2 * math.pi, 1.0)
     return rows, evidence.group
 
 

@@ -26,14 +26,13 @@ from __future__ import annotations
 import math
 
 import numba as nb
-import numpy as np
 
 from models.clothoid_kernel import BEND, COS, HEADING, SIN, X, Y
 from models.intersection.wrap import wrap
 
 # columns of a cue
 PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER = range(11)
-WIDTH = 11  # SPREAD is a variance [m^2], PRECISION 1 / std [1/rad], the last two are log densities
+WIDTH = 11  # SPREAD is a variance [m^2], PRECISION 1 / std [1/rad], CONSTANT a log density, CLUTTER a density or 0
 ROOT_HALF = math.sqrt(0.5)
 
 
@@ -67,12 +66,13 @@ def exact_cue(cue, offset, sample, rows):  # type: ignore[no-untyped-def]
     root = 1.0 / math.sqrt(variance)
     e = lateral * root
     turn = wrap(cue[FLOW] - sample[HEADING] - q - cue[TURN]) * cue[PRECISION]
-    log_density, weight = cue[CONSTANT] - 0.5 * math.log(variance) - 0.5 * (e * e + turn * turn), 1.0
-    if cue[CLUTTER] > -np.inf:
-        ahead = log_density - cue[CLUTTER]
-        odds = math.exp(-abs(ahead))
-        weight = (1.0 if ahead > 0.0 else odds) / (1.0 + odds)
-        log_density = max(log_density, cue[CLUTTER]) + math.log1p(odds)
+    log_road, weight = cue[CONSTANT] - 0.5 * (e * e + turn * turn), 1.0
+    if cue[CLUTTER] > 0.0:
+        road = root * math.exp(log_road)
+        weight = road / (road + cue[CLUTTER])
+        log_density = math.log(road + cue[CLUTTER])
+    else:
+        log_density = log_road + math.log(root)
     swing = -2.0 * ROOT_HALF * norm * (my * sx - mx * sy) / variance  # d variance / d heading, over sqrt(2) variance
     rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3] = e, -q * root, root, 0.0
     rows[0, 4], rows[0, 5] = -0.5 * along * along * root, -root

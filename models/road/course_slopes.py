@@ -39,7 +39,7 @@ def sample_row(by_x, by_y, by_heading, by_curvature, k, clothoid, table, moment,
     share = k / (len(table) - 1.0)
     s, curvature, rate, length = share * clothoid[LENGTH], clothoid[CURVATURE], clothoid[RATE], clothoid[LENGTH]
     dx, dy = table[k, X] - clothoid[X], table[k, Y] - clothoid[Y]
-    c1, s1, c2, s2 = moment[k]
+    c1, s1, c2, s2 = moment[k, 0], moment[k, 1], moment[k, 2], moment[k, 3]
     out[X], out[Y] = by_x, by_y
     out[HEADING] = by_heading - by_x * dy + by_y * dx
     out[CURVATURE] = by_curvature - by_x * s1 + by_y * c1 + by_heading * s

@@ -37,14 +37,14 @@ ROOT_HALF = math.sqrt(0.5)
 
 
 @nb.njit(error_model="numpy")
-def nearest_sample(cue, table, step):  # type: ignore[no-untyped-def]
-    """The sample (num, 6) whose normal comes nearest to the cue, by a walk from where the chord says it is."""
+def nearest_sample(cues, n, table, step):  # type: ignore[no-untyped-def]
+    """The sample of a table (num, 6) whose normal comes nearest to cue n, by a walk from where the chord says it is."""
     last = len(table) - 1
     chord_x, chord_y = table[last, X] - table[0, X], table[last, Y] - table[0, Y]
-    share = ((cue[PX] - table[0, X]) * chord_x + (cue[PY] - table[0, Y]) * chord_y) / (chord_x**2 + chord_y**2)
+    share = ((cues[n, PX] - table[0, X]) * chord_x + (cues[n, PY] - table[0, Y]) * chord_y) / (chord_x**2 + chord_y**2)
     k = int(min(max(share, 0.0), 1.0) * last + 0.5)
     for _ in range(4):
-        along = (cue[PX] - table[k, X]) * table[k, COS] + (cue[PY] - table[k, Y]) * table[k, SIN]
+        along = (cues[n, PX] - table[k, X]) * table[k, COS] + (cues[n, PY] - table[k, Y]) * table[k, SIN]
         new = min(max(k + math.floor(along / step + 0.5), 0), last)
         if new == k:
             break
@@ -53,24 +53,24 @@ def nearest_sample(cue, table, step):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
-def exact_cue(cue, offset, sample, rows):  # type: ignore[no-untyped-def]
-    """(log density, weight) of a cue; its residuals (3,) and their rows (3, 5) into rows (3, 6)."""
-    c, s, bend = sample[COS], sample[SIN], sample[BEND]
-    dx, dy = cue[PX] - sample[X], cue[PY] - sample[Y]
+def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
+    """(log density, weight) of cue n about sample k; its residuals (3,) and their rows (3, 5) into rows (3, 6)."""
+    c, s, bend = table[k, COS], table[k, SIN], table[k, BEND]
+    dx, dy = cues[n, PX] - table[k, X], cues[n, PY] - table[k, Y]
     along, across = dx * c + dy * s, dy * c - dx * s
     q = bend * along
     lateral = across - 0.5 * q * along - offset
     mx, my, norm = -s - c * q, c - s * q, 1.0 / (1.0 + q * q)
-    sx, sy = cue[SXX] * mx + cue[SXY] * my, cue[SXY] * mx + cue[SYY] * my
-    variance = cue[SPREAD] + norm * (mx * sx + my * sy)
+    sx, sy = cues[n, SXX] * mx + cues[n, SXY] * my, cues[n, SXY] * mx + cues[n, SYY] * my
+    variance = cues[n, SPREAD] + norm * (mx * sx + my * sy)
     root = 1.0 / math.sqrt(variance)
     e = lateral * root
-    turn = wrap(cue[FLOW] - sample[HEADING] - q - cue[TURN]) * cue[PRECISION]
-    log_road, weight = cue[CONSTANT] - 0.5 * (e * e + turn * turn), 1.0
-    if cue[CLUTTER] > 0.0:
+    turn = wrap(cues[n, FLOW] - table[k, HEADING] - q - cues[n, TURN]) * cues[n, PRECISION]
+    log_road, weight = cues[n, CONSTANT] - 0.5 * (e * e + turn * turn), 1.0
+    if cues[n, CLUTTER] > 0.0:
         road = root * math.exp(log_road)
-        weight = road / (road + cue[CLUTTER])
-        log_density = math.log(road + cue[CLUTTER])
+        weight = road / (road + cues[n, CLUTTER])
+        log_density = math.log(road + cues[n, CLUTTER])
     else:
         log_density = log_road + math.log(root)
     swing = -2.0 * ROOT_HALF * norm * (my * sx - mx * sy) / variance  # d variance / d heading, over sqrt(2) variance
@@ -78,30 +78,30 @@ def exact_cue(cue, offset, sample, rows):  # type: ignore[no-untyped-def]
     rows[0, 4], rows[0, 5] = -0.5 * along * along * root, -root
     rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3] = (1.0 - e * e) * ROOT_HALF, swing * norm * bend, 0.0, swing
     rows[1, 4], rows[1, 5] = swing * norm * along, 0.0
-    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = turn, -bend * cue[PRECISION], 0.0, -cue[PRECISION]
-    rows[2, 4], rows[2, 5] = -along * cue[PRECISION], 0.0
+    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = turn, -bend * cues[n, PRECISION], 0.0, -cues[n, PRECISION]
+    rows[2, 4], rows[2, 5] = -along * cues[n, PRECISION], 0.0
     return log_density, weight
 
 
 @nb.njit(error_model="numpy")
-def paper_cue(cue, offset, sample, rows):  # type: ignore[no-untyped-def]
+def paper_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
     """The same as printed."""
-    c, s = sample[COS], sample[SIN]
-    dx, dy = cue[PX] - sample[X], cue[PY] - sample[Y]
-    root = 1.0 / math.sqrt(cue[SPREAD])
+    c, s = table[k, COS], table[k, SIN]
+    dx, dy = cues[n, PX] - table[k, X], cues[n, PY] - table[k, Y]
+    root = 1.0 / math.sqrt(cues[n, SPREAD])
     along, lateral = (dx * c + dy * s) * root, (dy * c - dx * s - offset) * root
-    turn = cue[FLOW] - sample[HEADING] - cue[TURN]
-    anti = (1.0 - math.cos(turn)) * cue[PRECISION]
+    turn = cues[n, FLOW] - table[k, HEADING] - cues[n, TURN]
+    anti = (1.0 - math.cos(turn)) * cues[n, PRECISION]
     rows[:] = 0.0
     rows[0, 0], rows[0, 1] = along, root
     rows[1, 0], rows[1, 2], rows[1, 5] = lateral, root, -root
-    rows[2, 0], rows[2, 3] = anti, -math.sin(turn) * cue[PRECISION]
-    return cue[CONSTANT] + math.log(root) - 0.5 * (along * along + lateral * lateral + anti * anti), 1.0
+    rows[2, 0], rows[2, 3] = anti, -math.sin(turn) * cues[n, PRECISION]
+    return cues[n, CONSTANT] + math.log(root) - 0.5 * (along * along + lateral * lateral + anti * anti), 1.0
 
 
 @nb.njit(error_model="numpy")
-def score_cue(paper, cue, offset, sample, rows):  # type: ignore[no-untyped-def]
+def score_cue(paper, cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
     """(log density, weight) and rows of one or the other."""
     if paper:
-        return paper_cue(cue, offset, sample, rows)
-    return exact_cue(cue, offset, sample, rows)
+        return paper_cue(cues, n, offset, table, k, rows)
+    return exact_cue(cues, n, offset, table, k, rows)

@@ -44,9 +44,9 @@ def group_densities(x, mean, tril, num, paper, cues, group, loc, std, out):  # t
         if step == np.inf:
             continue
         for n in range(len(cues)):
-            g, sample = group[n], table[nearest_sample(cues[n], table, step)]
+            g, k = group[n], nearest_sample(cues, n, table, step)
             offset = loc[g] + std[g] * x[i, 6 + g]
-            out[i, g] += score_cue(paper, cues[n], offset, sample, rows)[0]
+            out[i, g] += score_cue(paper, cues, n, offset, table, k, rows)[0]
 
 
 @nb.njit(error_model="numpy")
@@ -65,8 +65,8 @@ def linearise(z, mean, tril, num, paper, cues, group, gradient, hessian):  # typ
     by_shape, square = np.zeros(6), np.zeros((6, 6))  # in the clothoid's numbers
     mixed, total = np.zeros((size, 6)), 0.0
     for n in range(len(cues)):
-        k, o = nearest_sample(cues[n], table, step), 6 + group[n]
-        log_density, weight = score_cue(paper, cues[n], z[o], table[k], rows)
+        k, o = nearest_sample(cues, n, table, step), 6 + group[n]
+        log_density, weight = score_cue(paper, cues, n, z[o], table, k, rows)
         total += log_density
         c, s = table[k, COS], table[k, SIN]
         dx, dy = cues[n, 0] - table[k, 0], cues[n, 1] - table[k, 1]
@@ -159,6 +159,6 @@ def explain(z, mean, tril, num, paper, cues, group, out):  # type: ignore[no-unt
         if step == np.inf:
             out[n, 0] = out[n, 1] = out[n, 2] = np.nan
             continue
-        sample = table[nearest_sample(cues[n], table, step)]
-        out[n, 2] = score_cue(paper, cues[n], z[6 + group[n]], sample, rows)[1]
+        k = nearest_sample(cues, n, table, step)
+        out[n, 2] = score_cue(paper, cues, n, z[6 + group[n]], table, k, rows)[1]
         out[n, 0], out[n, 1] = rows[1 if paper else 0, 0], rows[2, 0]

@@ -1,0 +1,211 @@
+"""Night roads, simulated by the road model itself: what [T17] shows, with the truth known.
+
+    course ~ prior of RoadCourse,  offsets ~ priors of their kinds,  cues ~ RoadCourse without clutter
+
+A camera measures a distance r with noise along and across the line of sight: 5 cm + 2 % r + .03 % r^2 / m along for
+what stands (structure from motion), 5 cm + 5 % r for vehicles (their known size), 2 cm + .2 % r across. Options depart
+from the model on purpose. Seeds 0 to 999 of `night_road` are the frozen scenes; what is there, the course, the noise
+and each option have their own streams, so that an option changes nothing but itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from experiments.scenarios.road_layout import (
+    Layout,
+    Row,
+    place_markings,
+    place_row,
+    place_vehicle,
+    random_layout,
+)
+from experiments.scenarios.scene import Scene
+from models.clothoid import Clothoid, Points, evaluate, hermite
+from models.program import InputError, quiet_doubles
+from models.road.along_road import scatter
+from models.road.course import RoadCourse
+from models.road.cues import Cues, line_of_sight
+from models.road.prior import course_moments
+
+Floats = NDArray[np.float64]
+MODEL = RoadCourse(clutter=0.0)
+LINE_STEP = 0.5  # of the true line [m]
+CLUTTER_REACH = 15.0  # to either side [m]
+
+
+def night_road(
+    seed: int = 0, clutter: float = 0.0, yaw: float = 0.0, mismatch: bool = False, markings: bool = False
+) -> Scene:
+    """A random night road of the model's prior.
+
+    seed      0 to 999 are the frozen scenes; larger ones are further draws
+    clutter   share of static cues that are moved aside by up to 15 m
+    yaw       drift [rad]: each old detection of a vehicle is turned about the car by N(0, yaw)
+    mismatch  the road is a line, a bend and clothoids between, not one clothoid
+    markings  both borders of the lane are seen too, to 70 m
+
+    The truth holds `course` (6,) and `offset` (G,) as the model's sites do, and `line` (M, 3): x, y, heading of the
+    course every half metre. Raises InputError for a negative seed and shares that are none."""
+    _check("night_road", seed)
+    if not 0 <= clutter <= 1 or not 0 <= yaw < np.inf:
+        raise InputError(f"scenario night_road: clutter is {clutter} and yaw is {yaw}; give a share and an angle >= 0")
+    streams = np.random.SeedSequence(seed).spawn(6)
+    where, layout = random_layout(np.random.default_rng(streams[0]))
+    if markings:
+        place_markings(layout, np.random.default_rng(streams[5]))
+    mean, tril = course_moments(MODEL.prior)
+    rng = np.random.default_rng(streams[1])
+    course = mean + tril @ rng.standard_normal(6)
+    line = composite(course[:3], np.random.default_rng(streams[3])) if mismatch else None
+    cues, truth = see(layout, course, rng, streams[2], line)
+    drift, disturb = (np.random.default_rng(s) for s in streams[4].spawn(2))
+    if yaw > 0:
+        cues = turn_vehicles(cues, drift.normal(0.0, yaw, len(cues.kind)))
+    if clutter > 0:
+        moved = (disturb.random(len(cues.kind)) < clutter) & np.isnan(cues.flow)
+        aside = disturb.uniform(-CLUTTER_REACH, CLUTTER_REACH, len(cues.kind))
+        cues.position[:, 1] += np.where(moved, aside, 0.0)
+    info = {"place": where, "clutter": clutter, "yaw": yaw, "mismatch": mismatch, "markings": markings}
+    return _scene("night_road", seed, cues, truth, info)
+
+
+def night_rural(seed: int = 0) -> Scene:
+    """A country road through a bend: markings, delineators on both sides, a car ahead. [T17] figure 4."""
+    _check("night_rural", seed)
+    layout, rng, noise = _begin(seed)
+    place_markings(layout, rng)
+    for left in (False, True):
+        place_row(layout, Row("delineator", left, 25.0), 130.0, rng)
+    place_vehicle(layout, "car", False, rng.uniform(50.0, 70.0), rng.uniform(2.0, 4.0))
+    bend = rng.choice([-1.0, 1.0]) / rng.uniform(250.0, 400.0)
+    return _scene("night_rural", seed, *see(layout, _ends(rng, bend, 1e-5), rng, noise))
+
+
+def night_highway(seed: int = 0) -> Scene:
+    """A highway under high beam: markings, reflectors on the guardrails of both sides. [T17] figure 5."""
+    _check("night_highway", seed)
+    layout, rng, noise = _begin(seed)
+    place_markings(layout, rng)
+    for left in (False, True):
+        place_row(layout, Row("guardrail", left, 20.0), 155.0, rng)
+    return _scene("night_highway", seed, *see(layout, _ends(rng, rng.normal(0.0, 1e-3), 3e-6), rng, noise))
+
+
+def night_urban(seed: int = 0) -> Scene:
+    """A street without markings: a few lanterns on both sides, more of them on the right. [T17] figure 6."""
+    _check("night_urban", seed)
+    layout, rng, noise = _begin(seed)
+    place_row(layout, Row("lantern", False, 28.0), 150.0, rng)
+    place_row(layout, Row("lantern", True, 45.0), 150.0, rng)
+    return _scene("night_urban", seed, *see(layout, _ends(rng, rng.normal(0.0, 2e-3), 1e-5), rng, noise))
+
+
+# Making a scene
+
+
+def see(
+    layout: Layout, course: Floats, rng: np.random.Generator, noise: np.random.SeedSequence, line: Points | None = None
+) -> tuple[Cues, dict[str, Floats]]:
+    """Cues of a layout along a course (6,), or along a line that is none, and the truth about them.
+
+    Offsets come from the priors of the kinds; noise is that at the true distance."""
+    num, arc = len(layout.kind), np.array(layout.arc)
+    vehicles = np.array([kind in ("car", "truck") for kind in layout.kind])
+    blank = np.zeros((num, 2)) + np.arange(num)[:, None]  # places to come; no two cues may be the same
+    cues = Cues(
+        kind=np.array(layout.kind),
+        left=np.array(layout.left),
+        track=np.array(layout.track),
+        position=blank,
+        covariance=np.broadcast_to(np.eye(2), (num, 2, 2)),
+        flow=np.where(vehicles, 0.0, np.nan),
+        flow_std=np.ones(num),
+        confidence=np.ones(num),
+    )
+    evidence = MODEL.prepare(cues)
+    offset = evidence.offset_loc + evidence.offset_std * rng.standard_normal(len(evidence.offset_loc))
+    road = _clothoid(course)
+    points = _at(line, arc) if line else _along(road, arc)
+    aside = offset[evidence.group]
+    x, y, heading = (v.numpy() for v in points[:3])
+    true = np.stack([x - np.sin(heading) * aside, y + np.cos(heading) * aside], -1)
+    distance = np.hypot(*true.T)
+    range_std = 0.05 + np.where(vehicles, 0.05 * distance, 0.02 * distance + 0.0003 * distance**2)
+    cues = cues._replace(
+        covariance=line_of_sight(true, range_std, 0.02 + 0.002 * distance), flow_std=0.02 + 0.0012 * distance
+    )
+    with quiet_doubles(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(noise.generate_state(1)[0]))
+        seen = scatter(points, torch.from_numpy(aside), MODEL.prepare(cues), MODEL).numpy()
+    cues = cues._replace(position=seen[:, :2], flow=np.where(vehicles, seen[:, 2], np.nan))
+    whole = line or _along(road, np.arange(0.0, float(road.length) + LINE_STEP, LINE_STEP))
+    track = np.stack([v.numpy() for v in whole[:3]], -1)
+    if line:
+        course = np.concatenate([track[0], track[-1]])
+    return cues, {"course": course, "offset": offset, "line": track}
+
+
+def turn_vehicles(cues: Cues, angle: Floats) -> Cues:
+    """Vehicles turned about the car by angles (N,) [rad]."""
+    angle = np.where(np.isnan(cues.flow), 0.0, angle)
+    x, y = cues.position.T
+    turned = np.stack([x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)], -1)
+    return cues._replace(position=turned, flow=cues.flow + angle)
+
+
+def composite(start: Floats, rng: np.random.Generator) -> Points:
+    """A road of pieces, every half metre: curvature runs evenly between four values at two inner places."""
+    reach = MODEL.prior.length
+    s = np.arange(0.0, reach + LINE_STEP, LINE_STEP)
+    first, second, last = rng.normal(0.0, MODEL.prior.curvature_std, 3) * [0.6, 1.0, 1.0]
+    places = np.sort(rng.uniform(30.0, reach - 25.0, 2))
+    curvature = np.interp(s, [0.0, *places, reach], [first, second, second + 0.3 * last, last])
+    heading = start[2] + LINE_STEP * np.concatenate([[0.0], np.cumsum(0.5 * (curvature[1:] + curvature[:-1]))])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    x = start[0] + LINE_STEP * np.concatenate([[0.0], np.cumsum(np.cos(middle))])
+    y = start[1] + LINE_STEP * np.concatenate([[0.0], np.cumsum(np.sin(middle))])
+    return Points(*(torch.from_numpy(v) for v in (x, y, heading, curvature)))
+
+
+def _at(line: Points, arc: Floats) -> Points:
+    """Points of a line with one every half metre, at arc lengths (N,)."""
+    s = LINE_STEP * np.arange(len(line.x))
+    return Points(*(torch.from_numpy(np.interp(arc, s, column.numpy())) for column in line))
+
+
+def _clothoid(course: Floats) -> Clothoid:
+    return hermite(torch.from_numpy(course[:3]), torch.from_numpy(course[3:]))
+
+
+def _along(road: Clothoid, arc: Floats) -> Points:
+    return evaluate(road, torch.from_numpy(arc))
+
+
+def _ends(rng: np.random.Generator, curvature: float, rate_std: float) -> Floats:
+    """Start and end (6,) of a road that the car is on, with this curvature where the car is."""
+    prior = MODEL.prior
+    rate = rng.normal(0.0, rate_std)
+    start = [-prior.behind, rng.normal(0.0, prior.lateral_std), rng.normal(0.0, prior.heading_std)]
+    numbers = (*start, curvature - prior.behind * rate, rate, prior.length)
+    road = Clothoid(*(torch.tensor(v, dtype=torch.float64) for v in numbers))
+    return np.array([*start, *(float(v[0]) for v in _along(road, np.array([prior.length]))[:3])])
+
+
+def _begin(seed: int) -> tuple[Layout, np.random.Generator, np.random.SeedSequence]:
+    scene, noise = np.random.SeedSequence(seed).spawn(2)
+    return Layout([], [], [], []), np.random.default_rng(scene), noise
+
+
+def _check(name: str, seed: int) -> None:
+    if seed < 0:
+        raise InputError(f"scenario {name}: seed is {seed}; choose 0 or more (0 to 999 are the frozen scenes)")
+
+
+def _scene(name: str, seed: int, cues: Cues, truth: dict[str, Floats], info: dict[str, Any] | None = None) -> Scene:
+    numbers = {"scenario": name, "seed": seed, "cues": len(cues.kind), "groups": len(truth["offset"])}
+    return Scene(cues, truth, f"{name} {seed}", numbers | (info or {}))

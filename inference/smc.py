@@ -27,7 +27,8 @@ from inference import weights
 from inference.factors import factored
 from inference.population import Movers, Population, Walkers
 from inference.posterior import Posterior, Snapshots
-from inference.progress import Progress
+from inference.progress import Progress, announce
+from inference.transform import whitening
 from models.program import InputError, Model, log_joint
 
 Array = NDArray[Any]
@@ -35,10 +36,12 @@ FEW = 20.0  # families below which a population has forgotten its beginnings
 
 
 def run(
-    model: Model,
+    model: Any,
     evidence: Any,
     *,
     seed: int,
+    init: dict[str, Any] | None = None,
+    transform: Literal["prior", "laplace"] = "prior",
     moves: Literal["auto", "walk", "model"] = "auto",
     num_particles: int = 1000,
     num_moves: int = 10,
@@ -47,17 +50,29 @@ def run(
 ) -> Posterior:
     """A population from p(z | y), all draws of equal weight, and the log evidence.
 
+    init           {site: (*event)} where the Laplace fit begins
+    transform      of the numbers that walk: the path leads from the "prior", or from a "laplace" fit, which is shorter
+                   but may miss what the fit does not reach
     moves          "walk" in whitened numbers, or the "model"'s own; "auto" takes its own where its dimension is unknown
     num_moves      steps of every particle in a stage; reversible jump needs many more than walks
     ess            share of the particles that the weights of a stage are worth
 
-    Raises InputError by name for latents that cannot be whitened and for a model without moves where its own are
-    asked for."""
+    Raises InputError by name for latents that cannot be whitened, for a model without moves where its own are asked
+    for, and for an init that no Laplace fit begins at."""
     began = time.perf_counter()
     _check(num_particles, num_moves, ess)
+    if init is not None and transform == "prior":
+        raise InputError("smc begins at the prior, not at init; leave init out or use transform=laplace")
     first, shared = np.random.SeedSequence(seed).spawn(2)
     rng = np.random.default_rng(shared)
-    population = _population(model, evidence, moves, num_particles, num_moves, first)
+    population: Population
+    if _jumps(model, moves):
+        if transform != "prior":
+            raise InputError(f"transform={transform} is for numbers that walk; use transform=prior or moves=walk")
+        with announce(f"compiling the sampler for {type(model).__name__}"):
+            population, evaluations, flags = Movers(model, evidence, num_particles, num_moves, first), 0, list[str]()
+    else:
+        population, evaluations, flags = _walkers(model, evidence, init, transform, num_particles, num_moves, first)
     exponents, log_evidence, families = [0.0], 0.0, np.arange(num_particles)
     shots = [(0.0, population.best())]
     with Progress("tempering", 100, progress) as bar:
@@ -83,12 +98,12 @@ def run(
         info={
             "engine": "smc",
             "seconds": time.perf_counter() - began,
-            "evaluations": population.evaluations,
+            "evaluations": evaluations + population.evaluations,
             "acceptance": population.acceptance,
             "exponents": exponents,
             "families": num_families,
             "log_evidence_error": math.sqrt(max(1.0 / num_families - 1.0 / num_particles, 0.0)),
-            "flags": _flags(num_families, num_particles),
+            "flags": flags + _flags(num_families, num_particles),
         },
         snapshots=_snapshots(model, evidence, shots),
     )
@@ -102,21 +117,30 @@ def _check(num_particles: int, num_moves: int, ess: float) -> None:
         raise InputError(f"ess is {ess}; choose a share between 0 and 1")
 
 
-def _population(
-    model: Any, evidence: Any, moves: str, num_particles: int, num_moves: int, seed: np.random.SeedSequence
-) -> Population:
+def _jumps(model: Any, moves: str) -> bool:
+    """Whether the particles make the model's own moves."""
     if moves not in ("auto", "walk", "model"):
         raise InputError(f"moves must be one of auto, walk, model, but is '{moves}'")
     if moves == "model" and not hasattr(model, "moves"):
         raise InputError(f"moves=model needs a model with moves(), but {type(model).__name__} has none; use moves=walk")
-    if moves == "model" or (moves == "auto" and hasattr(model, "moves") and getattr(model, "dimension", None)):
-        return Movers(model, evidence, num_particles, num_moves, seed)
+    return moves == "model" or (moves == "auto" and hasattr(model, "moves") and hasattr(model, "dimension"))
+
+
+def _walkers(
+    model: Any, evidence: Any, init: Any, transform: Any, num_particles: int, num_moves: int, seed: Any
+) -> tuple[Population, int, list[str]]:
+    """Particles that walk under log p(u, y) - log N(u; 0, I), evaluations for their coordinates, flags."""
     factors = factored(model, evidence)
     size = factors.depends.shape[1]
     if num_particles < 2 * size:
         raise InputError(f"num_particles is {num_particles}; a cloud of {size} numbers needs {2 * size} or more")
-    rng = np.random.default_rng(seed)
-    return Walkers(lambda u: factors.evaluate(u).sum(1), factors.latents, (num_particles, size), num_moves, rng)
+    target, _, evaluations, flags = whitening(model, evidence, factors, transform, init)
+
+    def density(u: Array) -> Array:
+        return np.asarray(target.evaluate(u).sum(1) + 0.5 * (np.square(u).sum(1) + size * math.log(2.0 * math.pi)))
+
+    shape, rng = (num_particles, size), np.random.default_rng(seed)
+    return Walkers(density, target.latents, shape, num_moves, rng), evaluations, flags
 
 
 def _share_done(exponents: list[float]) -> float:

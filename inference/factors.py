@@ -1,7 +1,8 @@
 """Any model as a whitened product of factors (models.capability.Factors), for engines that evaluate batches.
 
 A model with factors() hands over its compiled ones. Any other program is read through models.whitening.bind: one
-factor for each observed site, which may depend on every number; values and gradients come from torch.
+factor for each observed site, which may depend on every number; values and gradients come from torch. Where torch
+cannot see through a compiled density, gradients are central differences, at the price of 2 D values.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from torch import Tensor
 
 from models.capability import Factors, HasFactors
 from models.program import Latents, Model
-from models.whitening import bind
+from models.whitening import Bound, bind
 
 Array = NDArray[np.float64]
+DIFFERENCE = 1e-4  # step of central differences, in standard deviations of the prior
 
 
 def factored(model: Model, evidence: Any) -> Factors:
@@ -44,6 +46,11 @@ def factored(model: Model, evidence: Any) -> Factors:
         (slope,) = torch.autograd.grad(height.sum(), at)
         return height.detach().numpy(), slope.numpy()
 
+    def differences(x: Array) -> tuple[Array, Array]:
+        steps = DIFFERENCE * np.concatenate([np.eye(bound.size), -np.eye(bound.size)])
+        around = evaluate((x[:, None] + steps).reshape(-1, bound.size)).sum(-1).reshape(len(x), 2, bound.size)
+        return evaluate(x).sum(-1), (around[:, 0] - around[:, 1]) / (2.0 * DIFFERENCE)
+
     def latents(x: Array) -> dict[str, Array]:
         flat = torch.from_numpy(np.ascontiguousarray(x).reshape(-1, bound.size))
         found = bound.latents(flat)
@@ -54,4 +61,16 @@ def factored(model: Model, evidence: Any) -> Factors:
         return bound.whiten(values).numpy()
 
     depends = np.ones((width, bound.size), dtype=bool)
-    return Factors(evaluate, gradient, depends, sites, latents, whiten)
+    slope = gradient if _is_seen_through(bound) else differences
+    return Factors(evaluate, slope, depends, sites, latents, whiten)
+
+
+def _is_seen_through(bound: Bound) -> bool:
+    """Whether torch follows every observed density down to the numbers: one that moves must have a gradient."""
+    first, second = (torch.full((1, bound.size), at, dtype=torch.float64) for at in (0.1, 0.3))
+    try:
+        here = bound.log_likelihoods(first.requires_grad_())
+    except RuntimeError:  # a tensor with gradients has no numpy()
+        return False
+    there = bound.log_likelihoods(second)
+    return all(f.requires_grad or torch.equal(f, there[name]) for name, f in here.items())

@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
 from inference import squares
-from inference.arrow import spread, squared_norm
+from inference.arrow import colour, squared_norm
 from models.capability import Factors, HasSquares
 from models.program import InputError
 
@@ -150,8 +150,8 @@ def laplace(model: Any, evidence: Any, factors: Factors, x: Array) -> tuple[Affi
     if isinstance(model, HasSquares):
         problem = model.squares(evidence)
         path = squares.minimise(problem, x, num_steps=NUM_STEPS, damping=1e-3, tolerance=TOLERANCE)
-        root = np.linalg.inv(spread(path.factor, np.eye(len(x))))
-        mode, hessian, evaluations, flags = path.state.x, root.T @ root, len(path.visited), list[str]()
+        root = np.linalg.inv(colour(path.factor, np.eye(len(x))))  # F of H = F F^T
+        mode, hessian, evaluations, flags = path.state.x, root @ root.T, len(path.visited), list[str]()
         left = 0.5 * squared_norm(path.factor, path.state.gradient)
     else:
         mode, hessian, evaluations, left, flags = _descend(factors, x)

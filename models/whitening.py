@@ -7,6 +7,7 @@ Gaussian observation, and each Gaussian site that fix() froze below a latent, le
           loc + L x_i                     Normal, MultivariateNormal
           low + (high - low) Phi(x_i)     Uniform
           f(T(x_i))                       TransformedDistribution: its transforms f after the map T of its base
+          from_standard(x_i)              a distribution that brings its own map (OwnMap)
 
     r_j = L_j^-1 (y_j - loc_j)
 
@@ -20,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from pyro.distributions import ExpandedDistribution, MaskedDistribution
@@ -60,6 +61,15 @@ class _Whitened(Messenger):
             msg["value"], msg["done"] = _from_standard(msg["name"], msg["fn"], number), True
 
 
+@runtime_checkable
+class OwnMap(Protocol):
+    """A distribution that is the image of standard normal numbers of its own shape, and the way back."""
+
+    def from_standard(self, x: Tensor) -> Tensor: ...
+
+    def to_standard(self, value: Tensor) -> Tensor: ...
+
+
 WRAPPERS = (dist.Independent, MaskedDistribution, ExpandedDistribution)
 
 
@@ -87,6 +97,8 @@ def _from_standard(name: str, fn: Any, number: Tensor) -> Tensor:
         return value
     if isinstance(base, dist.Uniform):
         return base.low + (base.high - base.low) * torch.special.ndtr(number)
+    if isinstance(base, OwnMap):
+        return base.from_standard(number)
     raise _no_whitening(name, fn)
 
 
@@ -103,6 +115,8 @@ def _to_standard(name: str, fn: Any, value: Tensor) -> Tensor:
         return _to_standard(name, base.base_dist, value)
     if isinstance(base, dist.Uniform):
         return torch.special.ndtri((value - base.low) / (base.high - base.low))
+    if isinstance(base, OwnMap):
+        return base.to_standard(value)
     raise _no_whitening(name, fn)
 
 

@@ -36,7 +36,7 @@ class HardCoreAngles(TorchDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         active = torch.arange(self.slots) < self.num_arms[..., None]
-        gap = torch.remainder(value[..., :, None] - value[..., None, :] + math.pi, 2 * math.pi) - math.pi
+        gap = _wrap(value[..., :, None] - value[..., None, :])
         pair = active[..., :, None] & active[..., None, :] & ~torch.eye(self.slots, dtype=torch.bool)
         apart = ((gap.abs() >= MIN_SEPARATION) | ~pair).all(-1).all(-1)
         count = self.num_arms.double()
@@ -56,4 +56,42 @@ class HardCoreAngles(TorchDistribution):
         around = 2 * math.pi * torch.rand(*shape, 1, dtype=torch.float64) + gap.cumsum(-1)
         order = torch.where(active, torch.rand(*shape, self.slots), 2.0).argsort(-1)  # shuffles the active
         around = torch.where(active, around.gather(-1, order), 2 * math.pi * torch.rand(*shape, self.slots))
-        return torch.remainder(around + math.pi, 2 * math.pi) - math.pi
+        return _wrap(around)
+
+    def from_standard(self, x: Tensor) -> Tensor:
+        """Angles (*batch, S) from standard normal numbers: with the separations cut out, the other active arms are
+        uniform on what is left of the circle after the first one.
+
+            angle_1 = 2 pi u_1 - pi,   angle_i = angle_1 + w_i + delta (1 + #{active j > 1: w_j < w_i})
+            w_i = (2 pi - K delta) u_i,   u = Phi(x)
+
+        An isometry but for the scale, with jumps where two arms would pass one another. Where the first arm points
+        to +-pi, its number runs off to infinity on both sides."""
+        u = torch.special.ndtr(x)
+        first, others, free = u[..., :1] * (2 * math.pi) - math.pi, self._others(), self._free()
+        around = first + free * u + MIN_SEPARATION * (1 + _rank(u, others))
+        return torch.where(others, _wrap(around), u * (2 * math.pi) - math.pi)
+
+    def to_standard(self, value: Tensor) -> Tensor:
+        """The inverse of `from_standard`."""
+        others, beyond = self._others(), torch.remainder(value - value[..., :1], 2 * math.pi)
+        left = (beyond - MIN_SEPARATION * (1 + _rank(beyond, others))) / self._free()
+        return torch.special.ndtri(torch.where(others, left, (value + math.pi) / (2 * math.pi)))
+
+    def _others(self) -> Tensor:
+        """(*batch, S): the active slots but the first."""
+        slot = torch.arange(self.slots)
+        return (slot > 0) & (slot < self.num_arms[..., None])
+
+    def _free(self) -> Tensor:
+        """(*batch, 1): what is left of the circle without the separations."""
+        return 2 * math.pi - self.num_arms[..., None].double() * MIN_SEPARATION
+
+
+def _rank(value: Tensor, among: Tensor) -> Tensor:
+    """(*batch, S): how many of the slots `among` have a smaller value."""
+    return ((value[..., None, :] < value[..., :, None]) & among[..., None, :]).sum(-1)
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi

@@ -41,14 +41,14 @@ def sure_lanes(posterior: LanePosterior, scene: Scene) -> Figure:
         half.append((width[:-1] + width[1:]) / 2)
     figure = Figure(figsize=(7.6, 7.2), layout="constrained")
     axes = figure.add_subplot()
-    _tracks(axes, scene)
+    draw_tracks(axes, scene)
     values = np.concatenate(half)
     drawn = LineCollection(list(np.concatenate(pieces)), array=values, cmap="viridis_r", lw=2.2, zorder=3)
     drawn.set_clim(0.0, float(np.quantile(values, 0.98)))
     axes.add_collection(drawn)
     _alternatives(axes, posterior)
     figure.colorbar(drawn, ax=axes, shrink=0.7, label="90 % band: this far to either side [cm]")
-    _dress(axes)
+    dress(axes)
     sure = "" if posterior.probability is None else f", {(posterior.probability > SURE).sum()} of them sure"
     axes.set_title(f"{scene.name}: {len(lanes.lines)} lanes{sure}", loc="left", color=INK, fontsize=11)
     if posterior.alternatives:
@@ -63,17 +63,17 @@ def before_and_after(posterior: LanePosterior, scene: Scene) -> Figure:
     figure = Figure(figsize=(10.4, 5.6), layout="constrained")
     centre = np.asarray(posterior.estimate["centre"])
     for axes, title in zip(figure.subplots(1, 2), ("structure alone", "refined, 90 % bands"), strict=True):
-        _tracks(axes, scene)
+        draw_tracks(axes, scene)
         if title == "structure alone":
             axes.add_collection(LineCollection(first, color=BEFORE, lw=1.6, zorder=3))
         else:
             _alternatives(axes, posterior)
             for line, left, right in zip(lanes.lines, lanes.left, lanes.right, strict=True):
-                axes.fill(*_strip(line, left, right).T, color=BAND, lw=0, zorder=3)
+                axes.fill(*strip(line, left, right).T, color=BAND, lw=0, zorder=3)
             axes.add_collection(LineCollection(lanes.lines, color=AFTER, lw=0.8, zorder=4))
         if scene.truth is not None:
             axes.add_collection(LineCollection(scene.truth.lines, **TRUE_LINE, zorder=5))
-        _dress(axes)
+        dress(axes)
         axes.set(xlim=centre[0] + np.array([-ZOOM, ZOOM]), ylim=centre[1] + np.array([-ZOOM, ZOOM]))
         axes.set_title(title, loc="left", color=INK, fontsize=11)
     handles = [Line2D([], [], color=BEFORE, label="before"), Line2D([], [], color=AFTER, label="after")]
@@ -91,19 +91,19 @@ def _alternatives(axes: Axes, posterior: LanePosterior) -> None:
         axes.plot(*other.line.T, color=OTHER, ls=":", lw=1.6, alpha=max(other.probability, FAINTEST), zorder=3)
 
 
-def _strip(line: Floats, left: Floats, right: Floats) -> Floats:
+def strip(line: Floats, left: Floats, right: Floats) -> Floats:
     """Outline of a band around a centre line."""
     tangent = np.gradient(line, axis=0)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], 1) / np.linalg.norm(tangent, axis=1, keepdims=True)
     return np.concatenate([line + left[:, None] * normal, (line - right[:, None] * normal)[::-1]])
 
 
-def _tracks(axes: Axes, scene: Scene) -> None:
+def draw_tracks(axes: Axes, scene: Scene) -> None:
     points = scene.data.points
     axes.plot(*points.T, ls="none", marker=".", markersize=2.0, mew=0, color=TRACK, alpha=0.35, zorder=2)
 
 
-def _dress(axes: Axes) -> None:
+def dress(axes: Axes) -> None:
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.tick_params(colors=INK, labelsize=9)
     axes.spines[["top", "right"]].set_visible(False)

@@ -15,18 +15,21 @@ from experiments.scenarios.protocol import counts
 from experiments.scenarios.scene import Floats, Scene
 from models.program import InputError
 
-RADIUS = 60.0  # what counts as part of the junction, as the arms of the protocol [m]
+RADIUS = 60.0  # from the centre: the arms of the protocol [m]
 MOTOR = ("car", "truck", "bus", "van", "motorcycle")  # who keeps to the lanes
 
 
-def traffic(name: str = "lankershim_2", data_root: str = junction.DATA_ROOT, headings: bool = True) -> Scene:
-    """Recorded tracks of 30 m or more within 60 m of the centre of a real junction.
+def traffic(
+    name: str = "lankershim_2", data_root: str = junction.DATA_ROOT, headings: bool = True, radius: float = RADIUS
+) -> Scene:
+    """Recorded tracks of 30 m or more near the centre of a real junction.
 
     name      of a file in data_root/trajectories
     headings  hand over the measured headings
+    radius    distance from the centre to which tracks are part of the junction [m]
 
     Stops are removed, a point every metre is left, and the origin is the centre of the junction.
-    Raises InputError for a name or a data folder that is not there."""
+    Raises InputError for a name or a data folder that is not there, and where no track is left."""
     files = junction.find(data_root, "trajectories", ".csv.gz")
     vehicles = csv_tracks.read(junction.pick(name, files, "recording"), MOTOR)
     truth, quality = junction.read(name, data_root)
@@ -34,12 +37,12 @@ def traffic(name: str = "lankershim_2", data_root: str = junction.DATA_ROOT, hea
     pieces = []
     for vehicle in vehicles:
         points, heading = csv_tracks.even(vehicle._replace(points=vehicle.points - shift))
-        near = _longest_run(np.linalg.norm(points, axis=1) <= RADIUS)
+        near = _longest_run(np.linalg.norm(points, axis=1) <= radius)
         if len(near) > MIN_LENGTH:
             pieces.append((points[near], heading[near] if headings and heading is not None else None))
     if not pieces:
         raise InputError(
-            f"{files[name]}: none of {len(vehicles)} vehicles drives {MIN_LENGTH:g} m within {RADIUS:g} m "
+            f"{files[name]}: none of {len(vehicles)} vehicles drives {MIN_LENGTH:g} m within {radius:g} m "
             "of the centre; choose another recording"
         )
     data = csv_tracks.join(pieces)
@@ -48,6 +51,7 @@ def traffic(name: str = "lankershim_2", data_root: str = junction.DATA_ROOT, hea
     info = {
         "scenario": "traffic",
         "recording": name,
+        "radius": radius,
         "quality": quality,
         "vehicles": len(vehicles),
         "heading": "none" if data.heading is None else "measured",

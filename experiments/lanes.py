@@ -7,6 +7,7 @@ the bands of the best structure's lanes hold all of them, and each lane has a pr
 
     waybayes experiment=lanes                      a simulated junction, lane by lane
     waybayes experiment=lanes scenario.seed=3 engine.courses.heading_std=0.2
+    waybayes experiment=lanes engine=lanes_choice  arms with lanes or free curves, as the evidence says
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.course_choice import Choice, Rival, fit
 from experiments.lane_mixture import ReadLanes, mix
 from experiments.lane_posterior import LanePosterior, Lanes, OtherLane, State
 from experiments.readings import Reading, read
 from inference.posterior import Posterior
-from models.intersection.course_evidence import CourseEvidence
-from models.intersection.course_lines import centre_lines, lane_displacements
+from models.intersection.course_family import AnyEvidence, Courses, centre_lines, lane_displacements
 from models.intersection.courses import LaneCourses
 from models.intersection.evidence import JunctionEvidence
 from models.intersection.routes import RoutedTracks, Routes, find_routes
@@ -44,19 +45,28 @@ def estimate(
     seed: int,
     structure: Engine,
     refine: Engine,
-    courses: LaneCourses,
+    courses: Courses,
+    rival: Rival | None = None,
 ) -> LanePosterior:
-    """Run both engines. Raises InputError where a model is none of an intersection with the exact likelihood."""
+    """Run both engines; with a rival, lanes are of the family that the tracks speak for (experiments.course_choice).
+
+    Raises InputError where a model is none of an intersection with the exact likelihood."""
     if not isinstance(model, Junction) or model.likelihood != "exact":
         raise InputError(
             "engine lanes needs model=junction or junction_real with likelihood exact; it reads their routes"
         )
     seeds = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2)]
-    return with_lanes(model, evidence, structure(model, evidence, seed=seeds[0]), refine, courses, seeds[1])
+    families = courses if rival is None else Choice(courses, rival)
+    return with_lanes(model, evidence, structure(model, evidence, seed=seeds[0]), refine, families, seeds[1])
 
 
 def with_lanes(
-    model: Junction, evidence: JunctionEvidence, found: Posterior, refine: Engine, courses: LaneCourses, seed: int
+    model: Junction,
+    evidence: JunctionEvidence,
+    found: Posterior,
+    refine: Engine,
+    courses: Courses | Choice,
+    seed: int,
 ) -> LanePosterior:
     """A posterior of the structure with the lanes of its best state, and what its draws say about them."""
     began = time.perf_counter()
@@ -66,13 +76,18 @@ def with_lanes(
     others = [_refined(model, evidence, reading, refine, courses, seed) for reading in readings.kept[1:]]
     mixture = mix([best, *(lanes for lanes, _ in others)], BAND)
     flags = [*found.info.get("flags", []), *posterior.info.get("flags", []), *readings.flags]
-    info = found.info | {
-        "lanes": len(best.lines),
-        "readings": len(readings.kept),
-        "readings_share": readings.covered,
-        "lane_seconds": time.perf_counter() - began,
-        "flags": flags,
-    }
+    families = {key: value for key, value in posterior.info.items() if key.startswith("family")}
+    info = (
+        found.info
+        | families
+        | {
+            "lanes": len(best.lines),
+            "readings": len(readings.kept),
+            "readings_share": readings.covered,
+            "lane_seconds": time.perf_counter() - began,
+            "flags": flags,
+        }
+    )
     alternatives = []
     for probability, number, lane in mixture.alternatives:
         lanes, own = others[number - 1]
@@ -86,13 +101,18 @@ def with_lanes(
         probability=mixture.probability,
         alternatives=alternatives,
         first=centre_lines(course_evidence, {}),
-        lane_width=float(posterior.estimate.get("lane_width", course_evidence.loc["lane_width"])),
+        lane_width=float(posterior.estimate.get("lane_width", mean_width(model, found.estimate))),
         courses=posterior,
     )
 
 
 def _refined(
-    model: Junction, evidence: JunctionEvidence, reading: Reading, refine: Engine, courses: LaneCourses, seed: int
+    model: Junction,
+    evidence: JunctionEvidence,
+    reading: Reading,
+    refine: Engine,
+    courses: Courses | Choice,
+    seed: int,
 ) -> tuple[ReadLanes, Routes]:
     """The lanes of a reading; none where no track is on a route."""
     if len(reading.routes.connections) == 0:
@@ -101,7 +121,7 @@ def _refined(
     return _lanes_of(reading.share, *refined, seed), refined[2]
 
 
-def _lanes_of(share: float, posterior: Posterior, evidence: CourseEvidence, routes: Routes, seed: int) -> ReadLanes:
+def _lanes_of(share: float, posterior: Posterior, evidence: AnyEvidence, routes: Routes, seed: int) -> ReadLanes:
     """Lines of the estimate, and draws of them in proportion to the share of the reading."""
     draws = posterior.resample(max(round(share * NUM_DRAWS), 1), seed)
     across = lane_displacements(evidence, posterior.estimate, draws)
@@ -109,8 +129,13 @@ def _lanes_of(share: float, posterior: Posterior, evidence: CourseEvidence, rout
 
 
 def refine_lanes(
-    model: Junction, evidence: JunctionEvidence, found: Posterior, refine: Engine, courses: LaneCourses, seed: int
-) -> tuple[Posterior, CourseEvidence, Routes]:
+    model: Junction,
+    evidence: JunctionEvidence,
+    found: Posterior,
+    refine: Engine,
+    courses: Courses | Choice,
+    seed: int,
+) -> tuple[Posterior, AnyEvidence, Routes]:
     """From the best state of a structure to the courses: their posterior, what it was learnt from, the routes."""
     if evidence.tracks is None:
         raise InputError("lanes need whole tracks, but this evidence was simulated half by half")
@@ -124,20 +149,27 @@ def refine_routes(
     state: State,
     routes: Routes,
     refine: Engine,
-    courses: LaneCourses,
+    courses: Courses | Choice,
     seed: int,
-) -> tuple[Posterior, CourseEvidence, Routes]:
+) -> tuple[Posterior, AnyEvidence, Routes]:
     """From a structure and its routes to the courses; routes that are one lane are merged."""
     assert evidence.tracks is not None
     routed = RoutedTracks(evidence.tracks, whole_structure(model, state), routes)
-    course_evidence = courses.prepare(routed)
-    merged = merge_routes(course_evidence, routes, courses.spacing)
-    if len(merged.connections) < len(routes.connections):
-        routes, course_evidence = merged, courses.prepare(routed._replace(routes=merged))
-    return refine(courses, course_evidence, seed=seed), course_evidence, routes
+    own = courses.own if isinstance(courses, Choice) else courses
+    arms = own if isinstance(own, LaneCourses) else LaneCourses()
+    prepared = arms.prepare(routed)
+    merged = merge_routes(prepared, routes, arms.spacing)
+    same = arms is own and len(merged.connections) == len(routes.connections)
+    fitted = fit(refine, courses, routed._replace(routes=merged), seed, prepared if same else None)
+    return fitted.posterior, fitted.evidence, merged
 
 
 def whole_structure(model: Junction, state: State) -> dict[str, NDArray[Any]]:
     """A state with the fields of arms that the model holds constant."""
     slots = len(state["angle"])
     return dict(state) | {name: np.full(slots, value) for name, value in model.constants.items()}
+
+
+def mean_width(model: Junction, state: State) -> float:
+    """Width of a lane over the arms of a state [m]."""
+    return float(whole_structure(model, state)["width"][: int(state["num_arms"])].mean())

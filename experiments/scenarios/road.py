@@ -10,7 +10,7 @@ and each option have their own streams, so that an option changes nothing but it
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -56,22 +56,27 @@ def night_road(
         raise InputError(f"scenario night_road: clutter is {clutter} and yaw is {yaw}; give a share and an angle >= 0")
     streams = np.random.SeedSequence(seed).spawn(6)
     where, layout = random_layout(np.random.default_rng(streams[0]))
-    if markings:
-        place_markings(layout, np.random.default_rng(streams[5]))
     mean, tril = course_moments(MODEL.prior)
     rng = np.random.default_rng(streams[1])
     course = mean + tril @ rng.standard_normal(6)
-    line = composite(course[:3], np.random.default_rng(streams[3])) if mismatch else None
-    cues, truth = see(layout, course, rng, streams[2], line)
+    start, end = (torch.from_numpy(part) for part in np.split(course, 2))
+    line = composite(course[:3], np.random.default_rng(streams[3])) if mismatch else along(hermite(start, end))
+    seen = see(layout, line, rng, streams[2])
     drift, disturb = (np.random.default_rng(s) for s in streams[4].spawn(2))
     if yaw > 0:
-        cues = turn_vehicles(cues, drift.normal(0.0, yaw, len(cues.kind)))
+        seen = seen._replace(cues=turn_vehicles(seen.cues, drift.normal(0.0, yaw, len(seen.cues.kind))))
     if clutter > 0:
-        moved = (disturb.random(len(cues.kind)) < clutter) & np.isnan(cues.flow)
-        aside = disturb.uniform(-CLUTTER_REACH, CLUTTER_REACH, len(cues.kind))
-        cues.position[:, 1] += np.where(moved, aside, 0.0)
+        moved = (disturb.random(len(seen.cues.kind)) < clutter) & np.isnan(seen.cues.flow)
+        aside = disturb.uniform(-CLUTTER_REACH, CLUTTER_REACH, len(seen.cues.kind))
+        seen.cues.position[:, 1] += np.where(moved, aside, 0.0)
+    if markings:
+        painted, rng = Layout([], [], [], []), np.random.default_rng(streams[5])
+        place_markings(painted, rng)
+        more = see(painted, line, rng, streams[5].spawn(1)[0])
+        joined = Cues(*(np.concatenate(pair) for pair in zip(seen.cues, more.cues, strict=True)))  # type: ignore[arg-type]
+        seen = Seen(joined, seen.offset | more.offset)
     info = {"place": where, "clutter": clutter, "yaw": yaw, "mismatch": mismatch, "markings": markings}
-    return _scene("night_road", seed, cues, truth, info)
+    return _scene("night_road", seed, seen, line, info)
 
 
 def night_rural(seed: int = 0) -> Scene:
@@ -83,7 +88,8 @@ def night_rural(seed: int = 0) -> Scene:
         place_row(layout, Row("delineator", left, 25.0), 130.0, rng)
     place_vehicle(layout, "car", False, rng.uniform(50.0, 70.0), rng.uniform(2.0, 4.0))
     bend = rng.choice([-1.0, 1.0]) / rng.uniform(250.0, 400.0)
-    return _scene("night_rural", seed, *see(layout, _ends(rng, bend, 1e-5), rng, noise))
+    line = _bend(rng, bend, 1e-5)
+    return _scene("night_rural", seed, see(layout, line, rng, noise), line)
 
 
 def night_highway(seed: int = 0) -> Scene:
@@ -93,7 +99,8 @@ def night_highway(seed: int = 0) -> Scene:
     place_markings(layout, rng)
     for left in (False, True):
         place_row(layout, Row("guardrail", left, 20.0), 155.0, rng)
-    return _scene("night_highway", seed, *see(layout, _ends(rng, rng.normal(0.0, 1e-3), 3e-6), rng, noise))
+    line = _bend(rng, rng.normal(0.0, 1e-3), 3e-6)
+    return _scene("night_highway", seed, see(layout, line, rng, noise), line)
 
 
 def night_urban(seed: int = 0) -> Scene:
@@ -102,26 +109,41 @@ def night_urban(seed: int = 0) -> Scene:
     layout, rng, noise = _begin(seed)
     place_row(layout, Row("lantern", False, 28.0), 150.0, rng)
     place_row(layout, Row("lantern", True, 45.0), 150.0, rng)
-    return _scene("night_urban", seed, *see(layout, _ends(rng, rng.normal(0.0, 2e-3), 1e-5), rng, noise))
+    line = _bend(rng, rng.normal(0.0, 2e-3), 1e-5)
+    return _scene("night_urban", seed, see(layout, line, rng, noise), line)
 
 
 # Making a scene
 
 
-def see(
-    layout: Layout, course: Floats, rng: np.random.Generator, noise: np.random.SeedSequence, line: Points | None = None
-) -> tuple[Cues, dict[str, Floats]]:
-    """Cues of a layout along a course (6,), or along a line that is none, and the truth about them.
+class Line(NamedTuple):
+    """Points of a true course at arc lengths (M,) [m], about every half metre."""
 
-    Offsets come from the priors of the kinds; noise is that at the true distance."""
-    num, arc = len(layout.kind), np.array(layout.arc)
+    arc: Floats
+    points: Points
+
+    def at(self, arc: Floats) -> Points:
+        """Points at arc lengths (N,)."""
+        return Points(*(torch.from_numpy(np.interp(arc, self.arc, column.numpy())) for column in self.points))
+
+
+class Seen(NamedTuple):
+    """Cues, and the true offsets of their groups by name [m]."""
+
+    cues: Cues
+    offset: dict[str, float]
+
+
+def see(layout: Layout, line: Line, rng: np.random.Generator, noise: np.random.SeedSequence) -> Seen:
+    """The cues of a layout along a line (`along`). Offsets are drawn from the priors of the kinds; the noise is that at
+    the true distance."""
+    num = len(layout.kind)
     vehicles = np.array([kind in ("car", "truck") for kind in layout.kind])
-    blank = np.zeros((num, 2)) + np.arange(num)[:, None]  # places to come; no two cues may be the same
     cues = Cues(
         kind=np.array(layout.kind),
         left=np.array(layout.left),
         track=np.array(layout.track),
-        position=blank,
+        position=np.zeros((num, 2)) + np.arange(num)[:, None],  # to come; no two cues may be the same
         covariance=np.broadcast_to(np.eye(2), (num, 2, 2)),
         flow=np.where(vehicles, 0.0, np.nan),
         flow_std=np.ones(num),
@@ -129,9 +151,7 @@ def see(
     )
     evidence = MODEL.prepare(cues)
     offset = evidence.offset_loc + evidence.offset_std * rng.standard_normal(len(evidence.offset_loc))
-    road = _clothoid(course)
-    points = _at(line, arc) if line else _along(road, arc)
-    aside = offset[evidence.group]
+    aside, points = offset[evidence.group], line.at(np.array(layout.arc))
     x, y, heading = (v.numpy() for v in points[:3])
     true = np.stack([x - np.sin(heading) * aside, y + np.cos(heading) * aside], -1)
     distance = np.hypot(*true.T)
@@ -141,13 +161,9 @@ def see(
     )
     with quiet_doubles(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(noise.generate_state(1)[0]))
-        seen = scatter(points, torch.from_numpy(aside), MODEL.prepare(cues), MODEL).numpy()
-    cues = cues._replace(position=seen[:, :2], flow=np.where(vehicles, seen[:, 2], np.nan))
-    whole = line or _along(road, np.arange(0.0, float(road.length) + LINE_STEP, LINE_STEP))
-    track = np.stack([v.numpy() for v in whole[:3]], -1)
-    if line:
-        course = np.concatenate([track[0], track[-1]])
-    return cues, {"course": course, "offset": offset, "line": track}
+        measured = scatter(points, torch.from_numpy(aside), MODEL.prepare(cues), MODEL).numpy()
+    cues = cues._replace(position=measured[:, :2], flow=np.where(vehicles, measured[:, 2], np.nan))
+    return Seen(cues, dict(zip(evidence.names, offset.tolist(), strict=True)))
 
 
 def turn_vehicles(cues: Cues, angle: Floats) -> Cues:
@@ -158,8 +174,8 @@ def turn_vehicles(cues: Cues, angle: Floats) -> Cues:
     return cues._replace(position=turned, flow=cues.flow + angle)
 
 
-def composite(start: Floats, rng: np.random.Generator) -> Points:
-    """A road of pieces, every half metre: curvature runs evenly between four values at two inner places."""
+def composite(start: Floats, rng: np.random.Generator) -> Line:
+    """A road of pieces: curvature runs evenly between four values at two inner places."""
     reach = MODEL.prior.length
     s = np.arange(0.0, reach + LINE_STEP, LINE_STEP)
     first, second, last = rng.normal(0.0, MODEL.prior.curvature_std, 3) * [0.6, 1.0, 1.0]
@@ -169,31 +185,22 @@ def composite(start: Floats, rng: np.random.Generator) -> Points:
     middle = 0.5 * (heading[1:] + heading[:-1])
     x = start[0] + LINE_STEP * np.concatenate([[0.0], np.cumsum(np.cos(middle))])
     y = start[1] + LINE_STEP * np.concatenate([[0.0], np.cumsum(np.sin(middle))])
-    return Points(*(torch.from_numpy(v) for v in (x, y, heading, curvature)))
+    return Line(s, Points(*(torch.from_numpy(v) for v in (x, y, heading, curvature))))
 
 
-def _at(line: Points, arc: Floats) -> Points:
-    """Points of a line with one every half metre, at arc lengths (N,)."""
-    s = LINE_STEP * np.arange(len(line.x))
-    return Points(*(torch.from_numpy(np.interp(arc, s, column.numpy())) for column in line))
+def along(road: Clothoid) -> Line:
+    """A true course that is one clothoid."""
+    length = float(road.length)
+    arc = np.linspace(0.0, length, 1 + round(length / LINE_STEP))
+    return Line(arc, evaluate(road, torch.from_numpy(arc)))
 
 
-def _clothoid(course: Floats) -> Clothoid:
-    return hermite(torch.from_numpy(course[:3]), torch.from_numpy(course[3:]))
-
-
-def _along(road: Clothoid, arc: Floats) -> Points:
-    return evaluate(road, torch.from_numpy(arc))
-
-
-def _ends(rng: np.random.Generator, curvature: float, rate_std: float) -> Floats:
-    """Start and end (6,) of a road that the car is on, with this curvature where the car is."""
-    prior = MODEL.prior
-    rate = rng.normal(0.0, rate_std)
+def _bend(rng: np.random.Generator, curvature: float, rate_std: float) -> Line:
+    """A road that the car is on, with this curvature where the car is."""
+    prior, rate = MODEL.prior, rng.normal(0.0, rate_std)
     start = [-prior.behind, rng.normal(0.0, prior.lateral_std), rng.normal(0.0, prior.heading_std)]
     numbers = (*start, curvature - prior.behind * rate, rate, prior.length)
-    road = Clothoid(*(torch.tensor(v, dtype=torch.float64) for v in numbers))
-    return np.array([*start, *(float(v[0]) for v in _along(road, np.array([prior.length]))[:3])])
+    return along(Clothoid(*(torch.tensor(v, dtype=torch.float64) for v in numbers)))
 
 
 def _begin(seed: int) -> tuple[Layout, np.random.Generator, np.random.SeedSequence]:
@@ -206,6 +213,11 @@ def _check(name: str, seed: int) -> None:
         raise InputError(f"scenario {name}: seed is {seed}; choose 0 or more (0 to 999 are the frozen scenes)")
 
 
-def _scene(name: str, seed: int, cues: Cues, truth: dict[str, Floats], info: dict[str, Any] | None = None) -> Scene:
-    numbers = {"scenario": name, "seed": seed, "cues": len(cues.kind), "groups": len(truth["offset"])}
-    return Scene(cues, truth, f"{name} {seed}", numbers | (info or {}))
+def _scene(name: str, seed: int, seen: Seen, line: Line, info: dict[str, Any] | None = None) -> Scene:
+    """The scene with its truth; the course is where the line starts and ends."""
+    names = MODEL.prepare(seen.cues).names
+    track = np.stack([v.numpy() for v in line.points[:3]], -1)
+    course, offset = np.concatenate([track[0], track[-1]]), np.array([seen.offset[group] for group in names])
+    numbers = {"scenario": name, "seed": seed, "cues": len(seen.cues.kind), "groups": len(names)}
+    truth = {"course": course, "offset": offset, "line": track}
+    return Scene(seen.cues, truth, f"{name} {seed}", numbers | (info or {}))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 from experiments.junction_metrics import structure
@@ -83,6 +83,17 @@ def configured(name: str) -> Junction:
         model = instantiate(compose("run", [f"model={name}"]).model)
     assert isinstance(model, Junction)
     return model
+
+
+@lru_cache
+def configured_engine(name: str) -> Callable[..., Posterior]:
+    """The engine of the config engine=NAME, without a progress bar."""
+    from hydra import compose, initialize_config_module
+    from hydra.utils import instantiate
+
+    with initialize_config_module("configs", version_base="1.3"):
+        engine = instantiate(compose("run", [f"engine={name}"]).engine, _convert_="all")
+    return partial(engine, progress=False)
 
 
 def m20(likelihood: Literal["half", "point"] = "half", acceptance: Literal["paper", "printed"] = "paper") -> Setting:

@@ -4,8 +4,9 @@
 
 n of N draws of the structure posterior differ from the map; the halves keep odds finite: no odds lie beyond 2N + 1,
 nor is anything surer than that. Draws of a chain resemble each other, so that odds near these ends say less than their
-size; the run's flags tell where chains disagree. Chains that never left a wrong structure count as much as the others,
-so that the odds of the whole map raise more false alarms than those of its lanes.
+size. Shares are worth what the chains are worth: one that never left a wrong structure counts as much as the others, so
+that chains replace one another while they anneal (engine=rjmcmc_structure); the run's flags tell where they disagree.
+`python -m benchmarks.intersection --only map_right` counts how often the verdict is right.
 
 These are posterior odds under the prior of `Junction`, which knows nothing of the map: lane counts uniform on 0 to
 max_lanes, the number of arms uniform on 2 to 7. Multiply them by how much less (or more) often than that a

@@ -48,6 +48,9 @@ PROMISED = {
     "band_coverage_90_given": "",
     "band_coverage_90": "",
     "lanelet_routes_ok": ">= 1",
+    "map_right": ">= 0.95",
+    "map_added": ">= 0.95",
+    "map_lacking": ">= 0.95",
 }
 
 

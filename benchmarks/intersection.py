@@ -31,9 +31,16 @@ REFERENCE = fig.Figure(
 
 def measurements() -> tuple[fig.Measurement, ...]:
     """All measurements but the yardstick, in the order of the table."""
-    from benchmarks import junction_lanes, junction_likelihoods, junction_maps, junction_speed, junction_structure
+    from benchmarks import (
+        junction_lanes,
+        junction_likelihoods,
+        junction_maps,
+        junction_speed,
+        junction_structure,
+        junction_traffic,
+    )
 
-    parts = (junction_speed, junction_structure, junction_likelihoods, junction_lanes, junction_maps)
+    parts = (junction_speed, junction_structure, junction_likelihoods, junction_lanes, junction_maps, junction_traffic)
     return tuple(measurement for part in parts for measurement in part.MEASUREMENTS)
 
 

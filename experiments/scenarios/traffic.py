@@ -15,7 +15,7 @@ from experiments.scenarios.protocol import counts
 from experiments.scenarios.scene import Floats, Scene
 from models.program import InputError
 
-RADIUS = 60.0  # from the centre: the arms of the protocol [m]
+RADIUS = 75.0  # from the centre: maps end 60 m beyond the crossing area, up to 15 m wide [m]
 MOTOR = ("car", "truck", "bus", "van", "motorcycle")  # who keeps to the lanes
 
 

@@ -132,6 +132,32 @@ def test_unweighted_overdispersed_estimates_are_seen_to_be_biased(monkeypatch: p
     assert np.abs(z_scores(found, exact(TARGET, Q))).max() > 20
 
 
+def product() -> Factors:
+    """Two numbers of one site whose scores see each other: log p(y | x) = -x_0^2 x_1^2."""
+    return Factors(
+        evaluate=lambda x: -np.square(x).prod(1, keepdims=True),
+        gradient=lambda x: (-np.square(x).prod(1), -2 * x * np.square(x[:, ::-1])),
+        depends=np.ones((1, 2), bool),
+        sites={"x": slice(0, 2)},
+        latents=lambda x: {"x": x},
+        whiten=lambda state: np.asarray(state["x"], dtype=np.float64),
+    )
+
+
+def test_numbers_of_a_block_that_meet_are_weighted_together() -> None:
+    """E_q log p = -m_0 m_1 - (m_0 + m_1) / 2, m_d = mean_d^2 + sd_d^2: on a quadratic a lost weight would not show."""
+    target, num = target_of(product(), standard(2)), 24
+    q, reads = Gaussian(np.array([0.4, -0.3]), np.log(np.array([0.7, 0.5]))), reading(target, True)
+    plan = blocks(target.factors.sites, reads, num)
+    moment = np.square(q.mean) + np.exp(2 * q.log_sd)
+    pull = -2 * moment[::-1] - 1.0
+    truth = np.concatenate([pull * q.mean, pull * np.exp(2 * q.log_sd) + 1.0])
+    rng = np.random.default_rng(np.random.SeedSequence(6))
+    noises = (rng.standard_normal((num, 2)) for _ in range(REPEATS))
+    found = np.stack([overdispersed(target, q, e, 1.0, reads, True, plan, np.array([2.0]))[0] for e in noises])
+    assert np.abs(z_scores(found, truth)).max() < 4.5
+
+
 def test_slope_of_the_variance_by_tau_is_its_finite_difference() -> None:
     """Without control variates, whose coefficients move with tau a little: E[y^2] by brute force."""
     reads, num = reading(TARGET, True), 40000

@@ -5,6 +5,8 @@ Gauss-Newton Hessian H in natural units z = loc + scale x, so that
 
     gradient = x + scale g,   hessian = I + scale H scale
 
+H may be a sum of small blocks: its factor then has their shape, see inference.arrow.
+
 Prior scales may be learnt on the way (empirical Bayes; MacKay 1992, eq. 4.18, with four numbers' worth of trust in the
 configured scale s_0): for the numbers of one site, with posterior variances v_i of their whitened values,
 
@@ -18,9 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
+from inference.arrow import Factor, arrow, colour, factorise, half_log_determinant, solve, squared_norm, variances
 from inference.posterior import Posterior, Snapshots
 from models.capability import HasSquares, Squares
 from models.program import InputError
@@ -33,7 +34,8 @@ LEARNT_AFTER = (2, 4, 7, 11, 16, 22)  # steps: the inverse that learning needs c
 
 
 class State(NamedTuple):
-    """The problem at x, linearised: total cost, gradient (D,) and hessian (D, D) in x."""
+    """The problem at x, linearised: total cost, gradient (D,) in x, and Hessian (L, P, P) of the observations alone in
+    natural units, block by block."""
 
     x: Array
     cost: float
@@ -42,12 +44,14 @@ class State(NamedTuple):
 
 
 class Path(NamedTuple):
-    """What a minimisation did: the last state, prior scales (D,), latents by step, whether nothing is left to gain."""
+    """What a minimisation did: the last state, prior scales (D,), latents by step, whether nothing is left to gain, and
+    the factor of the undamped Hessian."""
 
     state: State
     scale: Array
     visited: list[tuple[float, float, Array]]  # seconds, cost, z (D,)
     converged: bool
+    factor: Factor
 
 
 def linearise(squares: Squares, scale: Array, x: Array, hessian: Array) -> State:
@@ -55,12 +59,10 @@ def linearise(squares: Squares, scale: Array, x: Array, hessian: Array) -> State
 
     Raises FloatingPointError where the cost is not finite."""
     gradient = np.empty(len(x))
-    cost = squares.evaluate(squares.loc + scale * x, hessian, gradient)
+    z = squares.loc + scale * x
+    cost = squares.evaluate(z, hessian[0] if squares.blocks is None else hessian, gradient)
     if not np.isfinite(cost):
-        raise FloatingPointError(f"the sum of squares is {cost} at {squares.unpack(squares.loc + scale * x)}")
-    hessian *= scale
-    hessian *= scale[:, None]
-    hessian.ravel()[:: len(x) + 1] += 1.0
+        raise FloatingPointError(f"the sum of squares is {cost} at {squares.unpack(z)}")
     return State(x, cost + 0.5 * float(x @ x), x + scale * gradient, hessian)
 
 
@@ -74,20 +76,18 @@ def minimise(
     unknown = [name for name in learn if name not in squares.sites]
     if unknown:
         raise InputError(f"learn names {', '.join(unknown)}, but the latents are {', '.join(squares.sites)}")
-    began, scale, growth, converged = time.perf_counter(), squares.scale, 2.0, False
-    own, spare, damped = (np.empty((len(x), len(x))) for _ in range(3))
+    began, scale, growth, stopped = time.perf_counter(), squares.scale, 2.0, False
+    shape = arrow(squares.blocks, len(x))
+    own, spare = (np.empty((*shape.slots.shape, shape.slots.shape[1])) for _ in range(2))
     state = linearise(squares, scale, x, own)
     visited = [(time.perf_counter() - began, state.cost, squares.loc + scale * x)]
     for number in range(num_steps):
-        damped[:] = state.hessian
-        damped.ravel()[:: len(x) + 1] *= 1.0 + damping
-        factor, failed = dpotrf(damped.T, lower=1, overwrite_a=1)  # LAPACK reads the transpose, which is the same
-        if failed:
-            raise FloatingPointError(f"the Hessian has no Cholesky factor (dpotrf says {failed}): it is not finite")
-        move = -dpotrs(factor, state.gradient, lower=1)[0]
-        promise = float(-state.gradient @ move - 0.5 * move @ state.hessian @ move)
+        factor = factorise(shape, state.hessian, scale, damping)
+        move = -solve(factor, state.gradient)
+        # a model's decrease -g.m - m.H m / 2, where (H + damping diag H) m = -g
+        promise = 0.5 * float(damping * (factor.diagonal * move) @ move - state.gradient @ move)
         if promise <= tolerance and (not learn or number > LEARNT_AFTER[1]):
-            converged = undamped_promise(state) <= max(tolerance, STALL)
+            stopped = True
             break
         new = linearise(squares, scale, state.x + move, spare)
         gain = state.cost - new.cost
@@ -96,11 +96,12 @@ def minimise(
             state, spare, growth = new, state.hessian, 2.0
         else:
             damping, growth = damping * growth, 2.0 * growth
-        if learn and number in LEARNT_AFTER:
-            variance = np.diag(dpotri(factor, lower=1, overwrite_c=1)[0])  # of the step's start: near enough
-            state, scale = relearn(squares, state, scale, variance, learn)
+        if learn and number in LEARNT_AFTER:  # variances of the step's start: near enough
+            state, scale = relearn(squares, state, scale, variances(factor), learn)
         visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
-    return Path(state, scale, visited, converged)
+    factor = factorise(shape, state.hessian, scale)
+    converged = stopped and 0.5 * squared_norm(factor, state.gradient) <= max(tolerance, STALL)
+    return Path(state, scale, visited, converged, factor)
 
 
 def relaxation(ratio: float) -> float:
@@ -108,36 +109,23 @@ def relaxation(ratio: float) -> float:
     return max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
 
 
-def undamped_promise(state: State) -> float:
-    """Decrease of the cost [nats] that an undamped step would bring to a linear problem."""
-    factor, _ = dpotrf(state.hessian, lower=1)
-    return 0.5 * float(state.gradient @ dpotrs(factor, state.gradient, lower=1)[0])
-
-
 def relearn(
     squares: Squares, state: State, scale: Array, variance: Array, learn: tuple[str, ...]
 ) -> tuple[State, Array]:
-    """The same latents under learnt prior scales: (state, scale (D,)); variance (D,) of x in the posterior.
-
-    The Hessian is changed where it is."""
+    """The same latents under learnt prior scales: (state, scale (D,)); variance (D,) of x in the posterior."""
     new = scale.copy()
     for name in learn:
         part = squares.sites[name]
         configured = squares.scale[part]
         gamma = float(np.clip(1.0 - variance[part], 0.0, 1.0).sum())
-        spread = float((((scale[part] * state.x[part]) / configured) ** 2).sum())
-        ratio = np.sqrt((TRUST + spread) / (TRUST + gamma))
+        far = float((((scale[part] * state.x[part]) / configured) ** 2).sum())
+        ratio = np.sqrt((TRUST + far) / (TRUST + gamma))
         new[part] = configured * np.clip(ratio, 1.0 / 5.0, WIDEST)
     factor = new / scale
     x = state.x / factor
-    flat, hessian = state.gradient - state.x, state.hessian  # flat: of the data alone
-    diagonal = hessian.ravel()[:: len(x) + 1]
-    diagonal -= 1.0
-    hessian *= factor
-    hessian *= factor[:, None]
-    diagonal += 1.0
+    flat = state.gradient - state.x  # of the data alone
     cost = state.cost - 0.5 * float(state.x @ state.x) + 0.5 * float(x @ x)
-    return State(x, cost, x + factor * flat, hessian), new
+    return State(x, cost, x + factor * flat, state.hessian), new
 
 
 def run(
@@ -162,19 +150,18 @@ def run(
         raise InputError(f"init has no value for {missing}; it holds {sorted(init)}")
     x = np.zeros(len(squares.loc)) if init is None else (squares.pack(init) - squares.loc) / squares.scale
     path = minimise(squares, x, num_steps=num_steps, damping=damping, tolerance=tolerance, learn=learn)
-    factor = np.linalg.cholesky(path.state.hessian)
-    noise = np.random.default_rng(np.random.SeedSequence(seed)).standard_normal((len(x), num_draws))
-    numbers = path.state.x[:, None] + solve_triangular(factor, noise, trans="T", lower=True)
+    noise = np.random.default_rng(np.random.SeedSequence(seed)).standard_normal((num_draws, len(x)))
+    numbers = path.state.x + colour(path.factor, noise)
     times, costs, states = zip(*path.visited, strict=True)
     scales = {name: float(path.scale[part][0]) for name, part in squares.sites.items() if name in learn}
     steps, volume = len(states) - 1, 0.5 * len(x) * np.log(2 * np.pi) + squares.log_volume
     flag = f"not converged after {num_steps} steps; raise num_steps or start closer (init)"
     if steps < num_steps:
-        left = f"{undamped_promise(path.state):.2g}"
+        left = f"{0.5 * squared_norm(path.factor, path.state.gradient):.2g}"
         flag = f"not converged: no step lowers the cost, though {left} nats are promised; start elsewhere (init)"
     return Posterior(
-        draws={n: v[None] for n, v in squares.unpack(squares.loc + path.scale * numbers.T).items()},
-        log_evidence=squares.log_const - path.state.cost - float(np.log(factor.diagonal()).sum()),
+        draws={n: v[None] for n, v in squares.unpack(squares.loc + path.scale * numbers).items()},
+        log_evidence=squares.log_const - path.state.cost - half_log_determinant(path.factor),
         estimate=squares.unpack(states[-1]),
         info={
             "evaluations": len(states),

@@ -151,9 +151,12 @@ class Squares(NamedTuple):
     loc, scale  (D,) of the prior
     sites       {site: part of z}, in the order of z
     shapes      {site: shape of its event}
-    evaluate    (z, hessian (D, D), gradient (D,)) -> cost; fills the Gauss-Newton model of the cost at z
+    evaluate    (z, hessian, gradient (D,)) -> cost; fills the Gauss-Newton model of the cost at z: hessian (D, D), or
+                (L, P, P) with `blocks`, of which the lower triangles are read
     log_const   of the observations: log p(y | z) = log_const - cost(z)
     correlated  {site: (mean, tril)} where the prior of a site is not diagonal: the site is mean + tril z
+    blocks      (L, P) for a Hessian that is a sum of L small ones: the latents that meet in each, -1 for none. A plate
+                makes such sums, and latents that are in one block only are solved for by themselves, which is quicker
     """
 
     loc: np.ndarray
@@ -163,6 +166,7 @@ class Squares(NamedTuple):
     evaluate: Callable[[np.ndarray, np.ndarray, np.ndarray], float]
     log_const: float
     correlated: Mapping[str, tuple[np.ndarray, np.ndarray]] = MappingProxyType({})
+    blocks: np.ndarray | None = None
 
     def unpack(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """(*batch, D) to {site: (*batch, *event)}."""
@@ -175,6 +179,20 @@ class Squares(NamedTuple):
         z = {n: np.asarray(latents[n], dtype=np.float64).reshape(-1) for n in self.sites}
         z |= {n: np.linalg.solve(tril, z[n] - mean) for n, (mean, tril) in self.correlated.items()}
         return np.concatenate([z[n] for n in self.sites])
+
+    def dense(self, z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Cost at z, its whole Hessian (D, D), all blocks in one matrix, and its gradient (D,)."""
+        size, gradient = len(self.loc), np.empty(len(self.loc))
+        if self.blocks is None:
+            hessian = np.empty((size, size))
+            cost = self.evaluate(z, hessian, gradient)
+        else:
+            parts, hessian = np.zeros((*self.blocks.shape, self.blocks.shape[1])), np.zeros((size + 1, size + 1))
+            cost = self.evaluate(z, parts, gradient)
+            for slots, part in zip(self.blocks, parts, strict=True):
+                np.add.at(hessian, np.ix_(slots, slots), np.tril(part) + np.tril(part, -1).T)  # -1: the last row
+        lower = np.tril(hessian[:size, :size])
+        return cost, lower + np.tril(lower, -1).T, gradient
 
     @property
     def log_volume(self) -> float:

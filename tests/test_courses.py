@@ -327,9 +327,7 @@ def cost_of(points: Points, weights: Array | None) -> float:
 def evaluate(scene: Simulated, latents: dict[str, Any]) -> tuple[float, Array, Array]:
     """Cost, hessian and gradient of the compiled sum of squares."""
     squares = MANY.squares(scene.evidence)
-    size = len(squares.loc)
-    hessian, gradient = np.empty((size, size)), np.empty(size)
-    return squares.evaluate(squares.pack(latents), hessian, gradient), hessian, gradient
+    return squares.dense(squares.pack(latents))
 
 
 @BOTH
@@ -404,10 +402,10 @@ def test_without_headings_their_values_and_noise_change_nothing() -> None:
     points = scene.evidence.points.clone()
     points[2] = 1.0
     other = replace(MANY, heading_std=0.7).squares(scene.evidence._replace(points=points))
-    new = np.empty_like(hessian), np.empty_like(gradient)
-    assert other.evaluate(other.pack(scene.latents), *new) == cost
-    np.testing.assert_array_equal(new[0], hessian)
-    np.testing.assert_array_equal(new[1], gradient)
+    new = other.dense(other.pack(scene.latents))
+    assert new[0] == cost
+    np.testing.assert_array_equal(new[1], hessian)
+    np.testing.assert_array_equal(new[2], gradient)
 
 
 def test_a_track_is_followed_past_a_sharp_bend() -> None:
@@ -415,8 +413,7 @@ def test_a_track_is_followed_past_a_sharp_bend() -> None:
     model = replace(MANY, width_std=0.0, bend_std=0.0, shift_std=0.0, offset_std=0.0)
     scene = simulated(model, 134, scene=19)
     middle, squares = {name: scene.evidence.loc[name] for name in scene.latents}, model.squares(scene.evidence)
-    size = len(squares.loc)
-    cost = squares.evaluate(squares.loc, np.empty((size, size)), np.empty(size))
+    cost = squares.dense(squares.loc)[0]
     assert cost == pytest.approx(cost_of(compare(scene, middle), None), rel=0.1)
 
 
@@ -441,7 +438,7 @@ def test_log_joint_is_that_of_the_squares(name: str, constants: tuple[str, ...])
         z = squares.pack({name: value[row] for name, value in draws.items()})
         x = (z - squares.loc) / squares.scale
         prior = -0.5 * float(x @ x) - float(np.log(squares.scale).sum()) - 0.5 * size * math.log(2 * math.pi)
-        cost = squares.evaluate(z, np.empty((size, size)), np.empty(size))
+        cost = squares.dense(z)[0]
         assert float(found[row]) == pytest.approx(squares.log_const - cost + prior, rel=1e-12, abs=1e-9)
 
 
@@ -507,8 +504,7 @@ def test_a_bend_is_found_without_the_bias_of_the_noise(exit_arm: float) -> None:
     model = replace(MANY, **{f"{name}_std": 0.0 for name in known})
     scene = driven(model, one_lane(exit_arm, (0, 0, 1, 0)), 1, None, 800)
     found, squares = least_squares.run(model, scene.evidence, seed=0).estimate, model.squares(scene.evidence)
-    error, hessian = squares.pack(found) - squares.pack(scene.latents), np.empty((4, 4))
-    squares.evaluate(squares.pack(found), hessian, np.empty(4))
+    error, hessian = squares.pack(found) - squares.pack(scene.latents), squares.dense(squares.pack(found))[1]
     assert error @ (hessian + np.diag(squares.scale**-2)) @ error < chi2.ppf(0.999, 4)
 
 

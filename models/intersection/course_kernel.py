@@ -17,7 +17,7 @@ import numpy as np
 
 from models.intersection.course_nodes import course_nodes
 from models.intersection.wrap import wrap
-from models.normal_equations import square_columns
+from models.normal_equations import add_columns
 
 STRIDE = 4  # nodes between those that a track's first point is compared with
 LOST = 5.0  # [m] from the node that a point was followed to: it is sought anew, for distances rise before a sharp bend
@@ -75,65 +75,75 @@ def sum_points(points, first, last, nodes, num, noise, sums):  # type: ignore[no
 
 
 @nb.njit(error_model="numpy")
-def residual_columns(nodes, num, noise, sums, columns):  # type: ignore[no-untyped-def]
-    """The mean residuals of all nodes, times the root of their weights, as columns (D + 1, .); returns how many."""
-    n, size = 0, len(columns) - 1
-    for j in range(num):
+def residual_columns(nodes, begin, end, inner, noise, sums, latent, columns):  # type: ignore[no-untyped-def]
+    """The mean residuals of nodes [begin, end), times the root of their weights, as columns (P + 1, .); their number.
+
+    latent  (P,) which of the lane's numbers the slopes are of
+    inner   [first, last) of the nodes whose headings belong to these: their slopes lie between the nodes beside them"""
+    n, size = 0, len(latent)
+    for j in range(begin, end):
         if sums[0, j] > 0.0:
             root = math.sqrt(sums[0, j]) / noise[0]
             for p in range(size):
-                columns[p, n] = -root * nodes[j, 5 + p]
+                columns[p, n] = -root * nodes[j, 5 + latent[p]]
             columns[size, n] = root * sums[1, j] / sums[0, j]
             n += 1
     if noise[1] == np.inf:
         return n
-    for j in range(1, num - 1):
+    for j in range(inner[0], inner[1]):
         if sums[0, j] > 0.0:
             root = math.sqrt(sums[0, j] / (noise[1] ** 2 + (nodes[j, 4] * noise[0]) ** 2))
             apart = math.hypot(nodes[j + 1, 0] - nodes[j - 1, 0], nodes[j + 1, 1] - nodes[j - 1, 1])
             for p in range(size):
-                columns[p, n] = -root * (nodes[j + 1, 5 + p] - nodes[j - 1, 5 + p]) / apart
+                columns[p, n] = -root * (nodes[j + 1, 5 + latent[p]] - nodes[j - 1, 5 + latent[p]]) / apart
             columns[size, n] = root * sums[2, j] / sums[0, j]
             n += 1
     return n
 
 
-@nb.njit(cache=True, error_model="numpy")
-def normal_equations(z, where, slots, lanes, reach, counts, tracks, starts, offsets, points, noise, hessian, gradient):  # type: ignore[no-untyped-def]
-    """Cost of all points, its gradient (D,) and Gauss-Newton Hessian (D, D) in the latent ones of the numbers z.
+@nb.njit(error_model="numpy")
+def square_lane(nodes, counts, noise, sums, latent, columns, block):  # type: ignore[no-untyped-def]
+    """Hessian and, in the row below, gradient of a lane in its latent numbers: block (P + 1, P), lower triangle.
 
-    where   (L, D') which of z each lane depends on; slots (L, D') their places among the latent ones, -1 for a constant
+    Arm by arm and the interior: a number of one arm moves no node of the other."""
+    block[:] = 0.0
+    first, last = counts[0], counts[0] + counts[1] + 1  # of the interior
+    total = last + counts[2]
+    parts = ((0, first, 1, first - 1), (first, last, first - 1, last + 1), (last, total, last + 1, total - 1))
+    for begin, end, left, right in parts:
+        add_columns(columns, residual_columns(nodes, begin, end, (left, right), noise, sums, latent, columns), block)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def normal_equations(  # type: ignore[no-untyped-def]
+    z, where, latent, slots, lanes, reach, counts, tracks, starts, offsets, points, noise, hessian, gradient
+):
+    """Cost of all points, its gradient (D,) in the latent ones of the numbers z and their Gauss-Newton Hessian, lane by
+    lane, (L, P, P), lower triangles.
+
+    where   (L, D') which of z each lane depends on; latent (P,) the columns of it that are latent, and slots (L, P)
+            their places among all latents
     lanes, reach, counts as in `course_nodes`, for every lane
     tracks  of lane l: tracks[starts[l]:starts[l + 1]]; track t holds points (3, N) offsets[t]:offsets[t + 1]"""
     most = 0
     for lane in range(len(where)):
         most = max(most, counts[lane, 0] + counts[lane, 1] + 1 + counts[lane, 2])
-    size, cost = where.shape[1], 0.0
-    nodes, sums, columns = np.empty((most, 5 + size)), np.empty((3, most)), np.empty((size + 1, 2 * most))
-    block, v = np.empty((size + 1, size)), np.empty(size)
-    hessian[:] = 0.0
+    width, size, cost = where.shape[1], len(latent), 0.0
+    nodes, sums, columns = np.empty((most, 5 + width)), np.empty((3, most)), np.empty((size + 1, 2 * most))
+    block, v = np.empty((size + 1, size)), np.empty(width)
     gradient[:] = 0.0
     for lane in range(len(where)):
-        index = where[lane]
-        for p in range(size):
-            v[p] = z[index[p]]
+        for p in range(width):
+            v[p] = z[where[lane, p]]
         num = course_nodes(v, lanes[lane], reach[lane], counts[lane], nodes)
         sums[:] = 0.0
         for k in range(starts[lane], starts[lane + 1]):
             t = tracks[k]
             cost += sum_points(points, offsets[t], offsets[t + 1], nodes, num, noise, sums)
-        square_columns(columns, residual_columns(nodes, num, noise, sums, columns), block)
+        square_lane(nodes, counts[lane], noise, sums, latent, columns, block)
         for p in range(size):
-            i = slots[lane, p]
-            if i >= 0:
-                gradient[i] += block[size, p]
-                for q in range(p + 1):
-                    k = slots[lane, q]
-                    if k >= 0:  # on a U-turn both ends share an arm: its numbers meet themselves twice
-                        hessian[max(i, k), min(i, k)] += 2.0 * block[p, q] if i == k and p != q else block[p, q]
-    for i in range(len(gradient)):
-        for k in range(i):
-            hessian[k, i] = hessian[i, k]
+            gradient[slots[lane, p]] += block[size, p]
+        hessian[lane] = block[:size]
     return cost
 
 

@@ -106,11 +106,13 @@ class LaneCourses:
         whole = Layout(evidence, self.sites)
         index = np.concatenate([np.arange(whole.sites[name].start, whole.sites[name].stop) for name in sites])
         base = whole.pack(evidence.loc)
-        data = evidence_arrays(self, evidence)
         slots = np.full(whole.size, -1)
         slots[index] = np.arange(len(index))
-        evaluate = partial(_evaluate, base, index, (whole.where, slots[whole.where], *data))
-        return Squares(loc, np.concatenate(scale), sites, shapes, evaluate, log_constant(self, evidence))
+        latent = np.flatnonzero(slots[whole.where[0]] >= 0)  # the same numbers of all lanes
+        blocks = np.ascontiguousarray(slots[whole.where[:, latent]])
+        data = (whole.where, latent, blocks, *evidence_arrays(self, evidence))
+        evaluate = partial(_evaluate, base, index, data)
+        return Squares(loc, np.concatenate(scale), sites, shapes, evaluate, log_constant(self, evidence), blocks=blocks)
 
 
 def evidence_arrays(model: LaneCourses, evidence: CourseEvidence) -> tuple[Any, ...]:
@@ -161,8 +163,9 @@ class PointsOnCourses(TorchDistribution):
             raise InputError("lane courses score the tracks that their evidence was prepared from; prepare() others")
         data, constant = evidence_arrays(self.model, self.evidence), log_constant(self.model, self.evidence)
         size = self.layout.size
-        hessian, gradient = np.empty((0, 0)), np.empty(0)
+        lanes, none = len(self.layout.where), np.zeros(0, np.int64)
+        hessian, gradient = np.empty((lanes, 0, 0)), np.empty(0)
         rows = self.numbers.detach().reshape(-1, size).numpy()
-        rest = (self.layout.where, np.full_like(self.layout.where, -1), *data, hessian, gradient)
+        rest = (self.layout.where, none, np.empty((lanes, 0), np.int64), *data, hessian, gradient)
         costs = [normal_equations(z, *rest) for z in rows]  # type: ignore[call-arg]
         return constant - torch.tensor(costs, dtype=torch.float64).reshape(self.batch_shape)

@@ -1,4 +1,4 @@
-"""Time of clothoids against pyclothoids, on one thread: python -m benchmarks.clothoid [--json]
+"""Processor time of clothoids against pyclothoids, one thread: python -m benchmarks.clothoid [--json]
 
 Needs the extra `peers` for the comparison. Both are timed in turn, BATCH clothoids at a time."""
 
@@ -20,13 +20,17 @@ if TYPE_CHECKING:
 BATCH, SAMPLES, REPEATS = 1000, 71, 30  # 71 samples are 2 m apart on 140 m of road
 ROADS = "roads with chords of 140 m and headings of N(0, 0.3 rad) off them"
 FIGURES = (
-    Figure("g1_us_batch", "us", f"G1 Hermite fit in torch, per clothoid of a batch of {BATCH} {ROADS}"),
+    Figure(
+        "g1_us_batch",
+        "us",
+        f"processor time of the G1 Hermite fit in torch, per clothoid of a batch of {BATCH} {ROADS}",
+    ),
     Figure("pyclothoids_us", "us", "the same fits by pyclothoids, one after the other"),
     Figure("g1_ratio", "", "pyclothoids_us over g1_us_batch", at_least=3.0),
     Figure(
         "sample_ratio",
         "",
-        f"time per sampled point of pyclothoids (SampleXY) over ours (sample, with headings and curvatures), "
+        f"processor time per sampled point of pyclothoids (SampleXY) over ours (sample, with headings and curvatures), "
         f"{SAMPLES} points on each clothoid",
         at_least=50.0,
     ),
@@ -45,13 +49,14 @@ def roads() -> tuple[Tensor, Tensor]:
 
 
 def microseconds(*jobs: Callable[[], object]) -> list[float]:
-    """Median time of each job per clothoid [us]; they take turns, so that other work meets all of them."""
+    """Median processor time of each job per clothoid [us]; they take turns. Waiting for other work does not count: it
+    would hide the short job."""
     times: list[list[float]] = [[] for _ in jobs]
     for _ in range(REPEATS + 1):
         for job, kept in zip(jobs, times, strict=True):
-            began = time.perf_counter()
+            began = time.process_time()
             job()
-            kept.append(1e6 * (time.perf_counter() - began) / BATCH)
+            kept.append(1e6 * (time.process_time() - began) / BATCH)
     return [median(kept[1:]) for kept in times]  # the first warms up
 
 

@@ -103,7 +103,8 @@ def hermite_or_inf(start: Tensor, end: Tensor) -> Clothoid:
 def evaluate(clothoid: Clothoid, arc: Tensor) -> Points:
     """Points at arc lengths `arc` (*B, N) [m], which may lie before the start and beyond the end: the clothoid goes on.
 
-    Gauss-Legendre integration from the start, good to 1e-9 of the arc length while it turns by less than 4 pi."""
+    Gauss-Legendre integration from the start: good to 1e-9 of the length on whatever `hermite` joins and a tenth of the
+    length beyond its ends; many turns farther it is not."""
     heading, curvature = _direction(clothoid, arc)
     dx, dy = integrals(clothoid, arc)
     return Points(clothoid.x[..., None] + dx[..., 0], clothoid.y[..., None] + dy[..., 0], heading, curvature)

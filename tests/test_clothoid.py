@@ -14,8 +14,8 @@ from torch import Tensor
 
 from benchmarks import clothoid as benchmark
 from benchmarks.timing import THREADS
-from models.clothoid import FEET, Clothoid, evaluate, hermite, hermite_or_inf, project, sample
-from models.clothoid_kernel import MAX_STRETCH
+from models.clothoid import FEET, Clothoid, _halley, evaluate, hermite, hermite_or_inf, project, sample
+from models.clothoid_kernel import MAX_STRETCH, guess_bow
 from models.program import InputError
 
 RNG = np.random.default_rng(0)
@@ -62,6 +62,17 @@ def test_a_fit_ends_where_it_should() -> None:
         torch.testing.assert_close(mine[:, 0] / found.length, true / found.length, rtol=0.0, atol=1e-10)
     off = torch.remainder(last.heading[:, 0] - end[:, 2] + 1.0, 2 * math.pi) - 1.0  # or 0 would be 2 pi
     torch.testing.assert_close(off, torch.zeros_like(off), rtol=0.0, atol=1e-9)
+
+
+def test_two_steps_bring_any_headings_to_the_root() -> None:
+    grid = torch.linspace(-math.pi, math.pi, 101, dtype=torch.float64)
+    p, q = (angle.flatten() for angle in torch.meshgrid(grid, grid, indexing="ij"))
+    bows = [guess_bow.py_func(p, q)]
+    for _ in range(5):
+        bows.append(_halley(bows[-1], p, q)[0])
+    assert (bows[0] - bows[5]).abs().max() < 0.6
+    assert (bows[2] - bows[5]).abs().max() < 1e-10
+    assert (bows[3] - bows[5]).abs().max() < 1e-14
 
 
 def test_5000_fits_equal_those_of_pyclothoids() -> None:
@@ -133,12 +144,9 @@ def test_points_are_those_of_fresnel_integrals() -> None:
     (s1, c1), (s0, c0) = fresnel((arc.numpy() - inflection) / unit), fresnel(-inflection / unit)
     ahead, aside = unit * (c1 - c0), np.sign(rate) * unit * (s1 - s0)  # of the heading at the inflection
     angle = heading - 0.5 * rate * inflection**2
-    np.testing.assert_allclose(
-        found.x.numpy() / size, (x + ahead * np.cos(angle) - aside * np.sin(angle)) / size, atol=1e-9
-    )
-    np.testing.assert_allclose(
-        found.y.numpy() / size, (y + ahead * np.sin(angle) + aside * np.cos(angle)) / size, atol=1e-9
-    )
+    dx = found.x.numpy() - (x + ahead * np.cos(angle) - aside * np.sin(angle))
+    dy = found.y.numpy() - (y + ahead * np.sin(angle) + aside * np.cos(angle))
+    assert (np.hypot(dx, dy) / size).max() < 1e-9
 
 
 def test_heading_and_curvature_are_derivatives() -> None:

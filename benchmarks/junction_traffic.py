@@ -72,15 +72,15 @@ def every(effort: Effort) -> Values:
     if not (Path(DATA) / "trajectories").exists():
         return {"traffic_m_each": Value(None, ABSENT)}
     each: dict[str, float] = {}
-    tracks = []
+    tracks, none = [], []
     for name in recordings.names(DATA):
         scene = recordings.traffic(name, DATA)
         try:
             each[name] = traffic_metrics.metrics(lanes(scene), scene)["traffic_m"]
         except InputError:
-            each[name] = math.nan
+            none.append(name)
         tracks.append(f"{name} {len(scene.data.offsets) - 1}")
-    return {"traffic_m_each": Value(each, "tracks: " + ", ".join(tracks))}
+    return {"traffic_m_each": Value(each, f"tracks: {', '.join(tracks)}; no lane: {', '.join(none) or 'none'}")}
 
 
 def simulated(effort: Effort) -> Values:
@@ -134,7 +134,7 @@ RECORDED = (
 MEASUREMENTS = (
     Measurement(RECORDED, recorded),
     Measurement(
-        (Figure("traffic_m_each", "m", "traffic_m of every recording; nan where no lane is found"),),
+        (Figure("traffic_m_each", "m", "traffic_m of every recording where lanes are found"),),
         every,
     ),
     Measurement(

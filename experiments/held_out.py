@@ -32,6 +32,7 @@ from experiments.scenarios import paths
 from experiments.scenarios.scene import Scene, join_tracks
 from experiments.traffic_lanes import Learn, TrafficPosterior
 from inference.posterior import Posterior
+from models.intersection.laid_tracks import ways
 from models.intersection.tracks import Tracks
 from models.program import InputError
 
@@ -100,10 +101,10 @@ def pick(tracks: Tracks, index: Ints) -> Tracks:
 
 def predictive(lanes: Lanes, train: Tracks, area: float) -> Predictive:
     """Lanes with the spread and the shares of the vehicles they were learnt from."""
-    route, pieces = lanes.routes.track_route, np.split(train.points, train.offsets[1:-1])
+    route, pieces = lanes.routes.track_route, _pieces(train)
     num, square = np.zeros(len(lanes.lines)), np.zeros(len(lanes.lines))
     for track in np.flatnonzero(route >= 0):
-        across = lateral(pieces[track], lanes.lines[route[track]])[0]
+        across = lateral(*pieces[track], lanes.lines[route[track]])[0]
         num[route[track]] += np.isfinite(across).sum()
         square[route[track]] += (across[np.isfinite(across)] ** 2).sum()
     spread = (TRUST * square.sum() / num.sum() + square) / (TRUST + num)
@@ -113,32 +114,38 @@ def predictive(lanes: Lanes, train: Tracks, area: float) -> Predictive:
     return Predictive(lanes.lines, [s + v for s, v in zip(spread, course, strict=True)], size / size.sum(), area)
 
 
-def lateral(points: Floats, line: Floats) -> tuple[Floats, Ints]:
-    """Distance (n,) of points across a line, infinite beyond its ends and where they are driven against it, and the
-    index of the nearest point of the line."""
+def lateral(points: Floats, heading: Floats, line: Floats) -> tuple[Floats, Ints]:
+    """Distance (n,) of points across a line, infinite beyond its ends and where their heading (n,) is against it, and
+    the index of the nearest point of the line."""
     _, nearest = cKDTree(line).query(points)
-    heading = paths.headings(line)[nearest]
+    course = paths.headings(line)[nearest]
     gap = points - line[nearest]
-    across = -np.sin(heading) * gap[:, 0] + np.cos(heading) * gap[:, 1]
-    along = np.cos(heading) * gap[:, 0] + np.sin(heading) * gap[:, 1]
-    last = len(line) - 1
-    step = float(np.linalg.norm(line[1] - line[0]))
-    beyond = ((nearest == 0) & (along < -step)) | ((nearest == last) & (along > step))
-    against = np.cos(paths.headings(points) - heading) < 0
-    return np.where(beyond | against, np.inf, across), nearest
+    across = -np.sin(course) * gap[:, 0] + np.cos(course) * gap[:, 1]
+    along = np.cos(course) * gap[:, 0] + np.sin(course) * gap[:, 1]
+    beyond = ((nearest == 0) & (along < 0)) | ((nearest == len(line) - 1) & (along > 0))
+    return np.where(beyond | (np.cos(heading - course) < 0), np.inf, across), nearest
 
 
 def log_density(given: Predictive, tracks: Tracks) -> Floats:
     """log p(track) of every track, (T,) [nats]: the equation above."""
     out = []
-    for points in np.split(tracks.points, tracks.offsets[1:-1]):
-        stray = math.log(STRAY) - math.log(given.area)
+    for points, heading in _pieces(tracks):
         logs = [math.log(STRAY) - len(points) * math.log(given.area)]
         for line, variance, share in zip(given.lines, given.variance, given.share, strict=True):
-            across, nearest = lateral(points, line)
-            v = variance[nearest]
-            on_it = -0.5 * (across**2 / v + np.log(2 * math.pi * v)) - math.log(paths.arc_length(line)[-1])
-            point = np.logaddexp(math.log1p(-STRAY) + on_it, stray)
+            across, nearest = lateral(points, heading, line)
+            point = point_log_density(across, variance[nearest], line, given.area)
             logs.append(math.log1p(-STRAY) + math.log(share) + point.sum())
         out.append(logsumexp(logs))
     return np.array(out)
+
+
+def point_log_density(across: Floats, variance: Floats, line: Floats, area: float) -> Floats:
+    """Log density (n,) of points of a vehicle on a lane: its bracket in the equation above [nats]."""
+    on_it = -0.5 * (across**2 / variance + np.log(2 * math.pi * variance)) - math.log(paths.arc_length(line)[-1])
+    return np.logaddexp(math.log1p(-STRAY) + on_it, math.log(STRAY) - math.log(area))
+
+
+def _pieces(tracks: Tracks) -> list[tuple[Floats, Floats]]:
+    """Points and directions of every track, of the smoothed path: those of single noisy steps point anywhere."""
+    every = ways(tracks)
+    return list(zip(every.pieces, np.split(every.heading, every.offsets[1:-1]), strict=True))

@@ -5,10 +5,10 @@ Where they are less than two lanes apart there is no room for a third between th
 
     u = (y - y_a) / (y_b - y_a)
 
-of the way: about 0 or 1 for those who keep to a or b. Who is in the middle for BINS bins or more has changed lanes or
-straddles. A connection that leads from one lane into the next does so too, but is driven as often as others: only
-groups with at most half as many tracks as either neighbour are in between. Lanes into a new pocket never are: no other
-lane runs before where they go.
+of the way: about 0 or 1 for those who keep to a or b. Who is near a in BINS bins or more and near b in as many has
+changed lanes; who is in the middle in as many straddles, or takes long to change. A connection that leads from one lane
+into the next does so too, but is driven as often as others: only groups with at most half as many tracks as either
+neighbour are in between. Lanes into a new pocket never are: no other lane runs before where they go.
 """
 
 from __future__ import annotations
@@ -40,4 +40,8 @@ def _squeezed(number: int, group: Ints, laid: Laid, size: Ints) -> bool:
     apart = beside[:, None] - beside  # (b, a, B)
     room = (apart > ROOM[0]) & (apart < ROOM[1])
     share = np.where(room, own - beside, np.nan) / np.where(room, apart, 1.0)
-    return bool((((share > MIDDLE) & (share < 1 - MIDDLE)).sum(-1) >= BINS).any())
+    near_a, middle, near_b = (
+        ((share > low) & (share < high)).sum(-1) >= BINS
+        for low, high in ((-MIDDLE, MIDDLE), (MIDDLE, 1 - MIDDLE), (1 - MIDDLE, 1 + MIDDLE))
+    )
+    return bool((middle | (near_a & near_b)).any())

@@ -87,7 +87,8 @@ def free_equations(z, curves, data, hessian, gradient):  # type: ignore[no-untyp
         if len(gradient) == 0:
             continue
         own_columns, own_block = columns[: size + 1], block[: size + 1, :size]
-        square_columns(own_columns, residual_columns(nodes, num, noise, sums, own_columns), own_block)
+        filled = residual_columns(nodes, 0, num, (1, num - 1), noise, sums, np.arange(size), own_columns)
+        square_columns(own_columns, filled, own_block)
         for p in range(size):
             gradient[index[p]] += own_block[size, p]
             for q in range(p + 1):

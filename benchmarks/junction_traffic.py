@@ -121,12 +121,12 @@ def _lane_error(scene: Scene) -> dict[str, float]:
 WHERE = f"recording {RECORDING}"
 RECORDED = (
     Figure("traffic_m", "m", f"{WHERE}: median distance of the lanes' points to the nearest map lane", at_most=0.2),
-    Figure("traffic_p90_m", "m", "their 90 % quantile", at_most=0.75),
+    Figure("traffic_p90_m", "m", "the 90 % quantile of the same distances", at_most=0.75),
     Figure("traffic_precision_1m", "share", "of these points within 1 m of a map lane", at_least=0.95),
     Figure("traffic_arms_precision_1m", "share", "the same outside the crossing area", at_least=0.95),
     Figure("traffic_recall_driven", "share", "of the map lanes that two vehicles drove that are found", at_least=0.75),
     Figure("traffic_raw_m", "m", "median distance of the points of the tracks to the nearest map lane"),
-    Figure("traffic_raw_p90_m", "m", "their 90 % quantile"),
+    Figure("traffic_raw_p90_m", "m", "the 90 % quantile of the same distances"),
     Figure("traffic_nll", "nats", f"{WHERE}: minus the log density of a point of unseen vehicles"),
     Figure("traffic_nll_splines", "nats", "the same where every lane is a spline by itself"),
     Figure("traffic_s", "s", "from tracks to lanes with bands, warm"),

@@ -106,9 +106,9 @@ def q_of(plan: Plan, numbers: Array) -> Gaussian:
 
 
 def share_of(plan: Plan, done: int) -> float:
-    """What the likelihood counts: 1 / inflation^2, the inflation falling evenly to one."""
+    """What the likelihood counts: 1 / inflation^2, the inflation falling to one by equal ratios."""
     left = 1.0 - done / (plan.annealed * plan.num_steps) if plan.annealed > 0 else 0.0
-    return (1.0 + (plan.inflation - 1.0) * max(left, 0.0)) ** -2
+    return plan.inflation ** (-2.0 * max(left, 0.0))
 
 
 def step(plan: Plan, state: State, noise: Array) -> State:

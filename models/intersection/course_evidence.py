@@ -12,7 +12,7 @@ from torch import Tensor
 
 from models.intersection.borders import BEYOND, FARTHEST, interior_radius
 from models.intersection.course_nodes import ARM_WAVE, INNER_WAVE
-from models.intersection.routes import RoutedTracks
+from models.intersection.routes import RoutedTracks, distinct
 from models.program import InputError
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def course_evidence(routed: RoutedTracks, spacing: float) -> CourseEvidence:
     points = np.vstack([(tracks.points - origin).T, heading])
     ends = np.stack([connections[:, :2], connections[:, 2:]], 1)  # (L, 2, 2)
     keys = np.concatenate([np.insert(ends[:, e], 0, e, axis=1) for e in range(2)])
-    stubs = np.unique(keys, axis=0, return_inverse=True)[1].reshape(2, -1).T
+    stubs = distinct(keys)[1].reshape(2, -1).T
     loc = prior_middles(structure, connections, int(stubs.max()) + 1)
     reach = farthest(points, tracks.offsets, order, track_route, connections, loc["angle"])
     counts = node_counts(loc, connections, reach, spacing)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.intersection.course_evidence import CourseEvidence
 from models.intersection.course_kernel import centre_line
-from models.intersection.course_nodes import ARM_WAVE, END, HEAD, INNER_WAVE, LOCAL, RIPPLED, WAVY
+from models.intersection.course_nodes import ARM_WAVE, INNER_WAVE, LOCAL, RIPPLED, WAVY
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -26,34 +27,51 @@ def needed(latent: Iterable[str]) -> tuple[str, ...]:
     return SITES[: next(num for num in WIDTHS if num > last)]
 
 
+class Column(NamedTuple):
+    """Where one number of a lane is found: entry `place` of the row of a site that belongs to the lane's `owner`."""
+
+    site: int
+    owner: int
+    width: int
+    place: int
+
+
+SELF, ARM, STUB, LANE = 0, 1, 3, 5  # owners: the junction, entry and exit arm, entry and exit stub, the lane itself
+
+
+@lru_cache
+def columns(sites: tuple[str, ...]) -> NDArray[np.int64]:
+    """The numbers of a lane in the order of `course_nodes`, rows of `Column`, (D', 4)."""
+    of = {name: sites.index(name) for name in sites}
+    out = [Column(of["centre"], SELF, 2, 0), Column(of["centre"], SELF, 2, 1), Column(of["lane_width"], SELF, 1, 0)]
+    for end in range(2):
+        out += [Column(of[name], ARM + end, 1, 0) for name in ARM_SITES]
+        out += [Column(of["offset"], STUB + end, 1, 0)]
+        out += [Column(of[name], LANE, 2, end) for name in ("advance", "handle")]
+    if "inner_wave" in sites:
+        out += [Column(of["inner_wave"], LANE, INNER_WAVE, i) for i in range(INNER_WAVE)]
+    if "arm_wave" in sites:
+        for end in range(2):
+            out += [Column(of["arm_wave"], ARM + end, ARM_WAVE, i) for i in range(ARM_WAVE)]
+            out += [Column(of["lane_wave"], STUB + end, ARM_WAVE, i) for i in range(ARM_WAVE)]
+    return np.array(out)
+
+
 class Layout:
-    """Sites in one vector of numbers, constants included, and the part of it that each lane depends on."""
+    """Sites in one vector of numbers, constants included, and the part of it that each lane depends on.
+
+    where  (L, D') of the numbers of `course_nodes`"""
 
     def __init__(self, evidence: CourseEvidence, sites: tuple[str, ...]) -> None:
-        sizes = [evidence.loc[name].size for name in sites]
-        ends = np.cumsum([0, *sizes])
+        ends = np.cumsum([0, *(evidence.loc[name].size for name in sites)])
         self.size = int(ends[-1])
-        self.sites = {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(sites)}
+        self.sites = {name: slice(int(ends[i]), int(ends[i + 1])) for i, name in enumerate(sites)}
         num = len(evidence.connections)
-        self.where = np.zeros((num, WIDTHS[len(sites)]), np.int64)
-        self.where[:, 1], self.where[:, 2] = 1, self.sites["lane_width"].start
-        for end in range(2):
-            first, arm = HEAD + END * end, evidence.connections[:, 2 * end]
-            for field, name in enumerate(ARM_SITES):
-                self.where[:, first + field] = self.sites[name].start + arm
-            own = [self.sites["offset"].start + evidence.stubs[:, end]]
-            own += [self.sites[name].start + 2 * np.arange(num) + end for name in ("advance", "handle")]
-            self.where[:, first + len(ARM_SITES) : first + END] = np.stack(own, 1)
-            if "arm_wave" in sites:
-                first = RIPPLED + 2 * ARM_WAVE * end
-                self.where[:, first : first + ARM_WAVE] = self._rows("arm_wave", arm, ARM_WAVE)
-                first += ARM_WAVE
-                self.where[:, first : first + ARM_WAVE] = self._rows("lane_wave", evidence.stubs[:, end], ARM_WAVE)
-        if "inner_wave" in sites:
-            self.where[:, LOCAL:RIPPLED] = self._rows("inner_wave", np.arange(num), INNER_WAVE)
-
-    def _rows(self, name: str, rows: Ints, width: int) -> Ints:
-        return np.asarray(self.sites[name].start + width * rows[:, None] + np.arange(width))
+        owners = np.column_stack(
+            [np.zeros(num, np.int64), evidence.connections[:, ::2], evidence.stubs, np.arange(num)]
+        )
+        site, owner, width, place = columns(sites).T
+        self.where = ends[site] + width * owners[:, owner] + place
 
     def pack(self, latents: Mapping[str, Any]) -> Array:
         """{site: (*event)} to (D,)."""

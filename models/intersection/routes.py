@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numba as nb
@@ -16,13 +17,39 @@ from models.intersection.kernel import NUM_HALVES, exact_data, junction_kernel, 
 from models.intersection.packing import ARM, HEAD
 from models.intersection.state import Junction, lane_points
 from models.intersection.tracks import Tracks
+from models.program import InputError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 SHORT = 8  # points at the end of a track that has no half there
-CLOSE = 4.0  # [m] from the middle of a lane that such an end is on, at most ...
-ALONG = 0.9  # ... and off its direction [rad]
-RELUCTANCE = 60.0  # nats: a half that turns early still tells its lane, though it scatters like a stray one
+
+
+@dataclass(frozen=True)
+class Routing:
+    """Thresholds of routes and of merging them (models.intersection.same_lane); `python -m benchmarks.lane_thresholds`
+    varies them on the real junctions that are not marked clean.
+
+    reluctance  of calling a half stray: one that turns early still tells its lane, though it scatters [nats]
+    close       the end of a track that has no half there is on a lane at most this far from its middle ... [m]
+    along       ... and off its direction [rad]
+    same        routes nearer than this on average in every stretch are one lane [m]
+    window      length of a stretch [m]
+
+    Raises InputError for one that is not positive."""
+
+    reluctance: float = 60.0
+    close: float = 4.0
+    along: float = 0.9
+    same: float = 1.35
+    window: float = 24.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise InputError(f"{name} of the routes must be positive, but is {value}; choose a larger one")
+
+
+ROUTING = Routing()
 
 
 class Routes(NamedTuple):
@@ -49,12 +76,12 @@ class RoutedTracks(NamedTuple):
 
 
 @nb.njit(cache=True)
-def closest_lanes(z, floats, ints, cache, arm, lane):  # type: ignore[no-untyped-def]
-    """Arm and lane (H,) of every half for the state evaluated last; -1 where being stray costs RELUCTANCE less."""
+def closest_lanes(z, floats, ints, cache, reluctance, arm, lane):  # type: ignore[no-untyped-def]
+    """Arm and lane (H,) of every half for the state evaluated last; -1 where being stray costs `reluctance` less."""
     which, _, _, _, rows, _, _ = memory(cache, ints[NUM_HALVES])
     coef, stray = exact_data(floats, ints[NUM_HALVES])
     for h in range(ints[NUM_HALVES]):
-        low, arm[h], lane[h] = stray[h] + RELUCTANCE, -1, -1
+        low, arm[h], lane[h] = stray[h] + reluctance, -1, -1
         for a in range(int(z[0])):
             if rows[int(which[1, a]), a, h] < low:
                 low, arm[h] = rows[int(which[1, a]), a, h], a
@@ -63,7 +90,9 @@ def closest_lanes(z, floats, ints, cache, arm, lane):  # type: ignore[no-untyped
             lane[h] = lane_number(coef, h, z[1], z[2], math.cos(own[0]), math.sin(own[0]), own)
 
 
-def find_routes(model: Junction, evidence: JunctionEvidence, estimate: Mapping[str, NDArray[Any]]) -> Routes:
+def find_routes(
+    model: Junction, evidence: JunctionEvidence, estimate: Mapping[str, NDArray[Any]], routing: Routing = ROUTING
+) -> Routes:
     """Every track on its most probable entry and exit lane; a track without one of them is on no route.
 
     A track with no half track on an arm, too short there or stray, goes by its last points (`complete_ends`).
@@ -76,21 +105,31 @@ def find_routes(model: Junction, evidence: JunctionEvidence, estimate: Mapping[s
     cache, out = np.zeros(kernel.cache_size), np.empty(2)
     kernel.evaluate(z, kernel.floats, kernel.ints, cache, out)
     arm, lane = np.empty(evidence.num_halves, np.int64), np.empty(evidence.num_halves, np.int64)
-    closest_lanes(z, kernel.floats, kernel.ints, cache, arm, lane)
+    closest_lanes(z, kernel.floats, kernel.ints, cache, routing.reluctance, arm, lane)
     ends = np.full((evidence.num_tracks, 4), -1)
     entry = np.arange(evidence.num_halves) < evidence.num_entries
     for side, first in ((entry, 0), (~entry, 2)):
         ends[evidence.track[side], first], ends[evidence.track[side], first + 1] = arm[side], lane[side]
-    complete_ends(model, evidence, estimate, ends)
+    complete_ends(model, evidence, estimate, ends, routing)
     whole = (ends[:, ::2] >= 0).all(1)
-    connections, route = np.unique(ends[whole], axis=0, return_inverse=True)
+    connections, route = distinct(ends[whole])
     track_route = np.full(len(ends), -1)
-    track_route[whole] = route.reshape(-1)
+    track_route[whole] = route
     return Routes(connections, track_route)
 
 
+def distinct(rows: Ints) -> tuple[Ints, Ints]:
+    """The different ones among rows (N, P) of small whole numbers, in their order, and which of them each is, (N,).
+
+    As numpy.unique, which is slow along an axis."""
+    least = rows.min(0, initial=0)
+    spans = rows.max(0, initial=0) - least + 1
+    _, first, which = np.unique((rows - least) @ np.cumprod([1, *spans[:0:-1]])[::-1], True, True)
+    return rows[first], which.reshape(-1)
+
+
 def complete_ends(
-    model: Junction, evidence: JunctionEvidence, estimate: Mapping[str, NDArray[Any]], ends: Ints
+    model: Junction, evidence: JunctionEvidence, estimate: Mapping[str, NDArray[Any]], ends: Ints, routing: Routing
 ) -> None:
     """Fill in lanes of track ends without a half: tracks that begin or end where the arms do not yet run straight.
 
@@ -107,14 +146,16 @@ def complete_ends(
         pieces = points[outer[:, None] + np.arange(SHORT)]  # (M, SHORT, 2)
         half = SHORT // 2
         course = side * (pieces[:, :half].mean(1) - pieces[:, half:].mean(1))  # outwards
-        apart = np.linalg.norm(lines[None] - pieces.mean(1)[:, None, None], axis=-1)  # (M, lanes, n)
-        nearest = apart.argmin(-1)
-        steps = np.gradient(lines, axis=1)[np.arange(len(lines)), nearest]  # (M, lanes, 2) outwards
+        x, y = pieces.mean(1).T[..., None, None]
+        apart = np.hypot(lines[..., 0] - x, lines[..., 1] - y)  # (M, lanes, n)
+        inner = np.minimum(apart.argmin(-1), lines.shape[1] - 2)
+        lane = np.arange(len(lines))
+        steps = lines[lane, inner + 1] - lines[lane, inner]  # (M, lanes, 2) outwards
         aligned = (steps * course[:, None]).sum(-1)  # |step| |course| cos(turn)
         lengths = np.linalg.norm(steps, axis=-1) * np.linalg.norm(course, axis=-1)[:, None]
-        cost = np.where(aligned > math.cos(ALONG) * lengths, apart.min(-1), np.inf)
+        cost = np.where(aligned > math.cos(routing.along) * lengths, apart.min(-1), np.inf)
         best = cost.argmin(1)
-        found = cost.min(1) < CLOSE
+        found = cost.min(1) < routing.close
         ends[missing[found], end : end + 2] = names[best[found]]
 
 
@@ -124,4 +165,4 @@ def _arm_lanes(model: Junction, estimate: Mapping[str, NDArray[Any]], side: Lite
     counts = np.asarray(estimate["entries" if side == 1 else "exits"])[: int(estimate["num_arms"])]
     names = np.array([(arm, lane) for arm, count in enumerate(counts) for lane in range(-1, int(count) + 1)])
     s = np.arange(0.0, 80.0)
-    return names, np.stack([lane_points(estimate, arm, lane, side, s, model.width) for arm, lane in names])
+    return names, lane_points(estimate, names[:, 0], names[:, 1], side, s, model.width)

@@ -161,20 +161,22 @@ class Junction:
 
 def lane_points(
     estimate: Mapping[str, NDArray[Any]],
-    arm: int,
-    lane: int,
+    arm: Any,
+    lane: Any,
     side: Literal[1, -1],
     s: NDArray[np.float64],
     width: float = 2.7,
 ) -> NDArray[np.float64]:
-    """Centre line (n, 2) of a lane at distances s (n,) from the centre; side 1: entry, -1: exit.
+    """Centre line (n, 2) of a lane at distances s (n,) from the centre; side 1: entry, -1: exit. Of several lanes, arm
+    and lane (L,), the lines (L, n, 2).
 
     c + s d + (offset + bend s (s - CHORD) / 2) n,  offset = shift + side (gap / 2 + (lane + 1/2) width)
 
     `width` is used where the estimate has none."""
-    field = lambda name, default: float(estimate[name][arm]) if name in estimate else default  # noqa: E731
+    field = lambda name, default: np.asarray(estimate[name])[arm] if name in estimate else default  # noqa: E731
     angle, w = field("angle", 0.0), field("width", width)
-    d, n = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    d = np.stack([np.cos(angle), np.sin(angle)], -1)[..., None, :]
+    n = np.stack([-np.sin(angle), np.cos(angle)], -1)[..., None, :]
     offset = field("shift", 0.0) + side * (field("gap", 0.0) / 2 + (lane + 0.5) * w)
-    across = offset + field("bend", 0.0) * s * (s - CHORD) / 2
-    return np.asarray(estimate["centre"]) + s[:, None] * d + across[:, None] * n
+    across = np.asarray(offset)[..., None] + np.asarray(field("bend", 0.0))[..., None] * s * (s - CHORD) / 2
+    return np.asarray(estimate["centre"] + s[:, None] * d + across[..., None] * n)

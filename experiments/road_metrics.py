@@ -1,0 +1,158 @@
+"""How far an estimated road course runs from the true one, and how far ahead it may be trusted.
+
+Everything is measured at points of the true course, `RANGES` metres from the car. A tube is a half width that grows
+with the range r; a course is inside it where no point of the truth is farther from it than that:
+
+    tight .4 + .006 r    mid .6 + .010 r    wide .8 + .015 r   [m]
+
+[T17] section 3 counts an estimate wholly inside its labelled tube as a true positive and any other as a false positive;
+it gives no widths, these are ours. Knowing how far to trust an estimate is part of estimating: the calibrated range
+ends where the posterior probability of having stayed inside the mid tube so far falls below `CUT`; an estimate whose
+calibrated range is below `LEAST_RANGE` abstains, a third outcome. Denominators are all scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.scenarios.scene import Scene
+from inference.posterior import Posterior
+from models.clothoid_kernel import BEND, COLUMNS, COS, LENGTH, SIN, X, Y, hermite_one, sample_one
+from models.road.cue_kernel import nearest_sample
+
+Floats = NDArray[np.float64]
+
+RANGES = np.arange(5.0, 141.0, 5.0)  # [m]
+TOLD = (40.0, 80.0, 140.0)  # ranges whose errors are reported [m]
+TUBES = {"tight": (0.4, 0.006), "mid": (0.6, 0.010), "wide": (0.8, 0.015)}
+CUT = 0.9
+BAND = (0.05, 0.95)  # quantiles
+LEAST_RANGE = 40.0  # [m]
+SAMPLES = 41  # of a course, about four metres apart
+
+
+class RoadCheck(NamedTuple):
+    """One estimate against the truth, at R ranges.
+
+    error     (R,) of the truth to the left of the estimated course [m]
+    spread    (R,) posterior standard deviation of that [m]
+    covered   (R,) whether the truth is inside the central 90 % of the draws
+    reach     calibrated range [m]; 0 where even the first point is not trusted
+    """
+
+    error: Floats
+    spread: Floats
+    covered: NDArray[np.bool_]
+    reach: float
+
+    def inside(self, tube: str, farthest: float = RANGES[-1]) -> bool:
+        """Whether the estimate is in the tube at every range up to `farthest`."""
+        return bool((np.abs(self.error) <= half_width(tube))[RANGES <= farthest].all())
+
+    @property
+    def outcome(self) -> str:
+        """'true' or 'false' up to the calibrated range, in the mid tube; 'none' for an abstention."""
+        if self.reach < LEAST_RANGE:
+            return "none"
+        return "true" if self.inside("mid", self.reach) else "false"
+
+    def at(self, distance: float) -> int:
+        """Index of a range."""
+        return int(np.flatnonzero(RANGES == distance)[0])
+
+
+def half_width(tube: str) -> Floats:
+    """Half width of a tube at RANGES, (R,) [m]."""
+    near, growth = TUBES[tube]
+    return near + growth * RANGES
+
+
+def check_course(posterior: Posterior, line: Floats, cut: float = CUT, num_draws: int = 400) -> RoadCheck:
+    """The posterior mean of `course` against a true line (M, 3), or (M, 2), that begins behind the car.
+
+    num_draws  of the posterior that spread, coverage and range are counted from"""
+    courses, mean, truth = drawn_courses(posterior, num_draws), posterior.mean("course"), at_ranges(line)
+    error = lateral_offsets(mean[None], truth)[0]
+    offsets = lateral_offsets(courses, np.concatenate([truth, course_points(mean)]))
+    there, apart = np.split(offsets, 2, axis=1)
+    low, high = np.quantile(there, BAND, axis=0)
+    return RoadCheck(error, there.std(0), (low <= 0.0) & (high >= 0.0), trusted_range(apart, cut))
+
+
+def drawn_courses(posterior: Posterior, num_draws: int = 400) -> Floats:
+    """Equally weighted draws of `course`, at most `num_draws` of them, (D, 6)."""
+    courses = posterior.draws["course"].reshape(-1, 6)
+    if posterior.log_weights is None and len(courses) <= num_draws:
+        return courses
+    return posterior.resample(num_draws, 0)["course"]
+
+
+def trusted_range(apart: Floats, cut: float = CUT) -> float:
+    """Calibrated range [m] from how far points of the estimate at RANGES are from drawn courses, (D, R) [m]."""
+    stayed = np.logical_and.accumulate(np.abs(apart) <= half_width("mid"), axis=1).mean(0)
+    return float(RANGES[stayed >= cut].max(initial=0.0))  # the share falls with the range
+
+
+def at_ranges(line: Floats) -> Floats:
+    """Points (R, 2) of a line (M, 2 or 3) at RANGES from the car, counted ahead of it."""
+    distance = np.hypot(line[:, 0], line[:, 1]) * np.sign(line[:, 0])
+    return np.stack([np.interp(RANGES, distance, line[:, axis]) for axis in range(2)], -1)
+
+
+def course_points(course: Floats) -> Floats:
+    """Points (R, 2) of a course (6,) at RANGES."""
+    clothoid, table = np.empty(6), np.empty((SAMPLES, COLUMNS))
+    lay(course, clothoid, table)
+    return at_ranges(table[:, [X, Y]])
+
+
+@nb.njit(cache=True)
+def lay(course: Floats, clothoid: Floats, table: Floats) -> float:
+    """Samples of a course (6,) into a table; returns their step [m], inf where no clothoid joins its ends."""
+    hermite_one(course[0], course[1], course[2], course[3], course[4], course[5], clothoid)
+    return sample_one(clothoid, table) if clothoid[LENGTH] < np.inf else np.inf
+
+
+@nb.njit(cache=True)
+def lateral_offsets(courses: Floats, points: Floats) -> Floats:
+    """How far left of courses (D, 6) points (R, 2) are, (D, R) [m]; inf where no clothoid joins the ends.
+
+    The parabola through the nearest sample stands for the course: exact to .1 mm on any road of the prior."""
+    out, clothoid, table = np.empty((len(courses), len(points))), np.empty(6), np.empty((SAMPLES, COLUMNS))
+    for d in range(len(courses)):
+        step = lay(courses[d], clothoid, table)
+        for r in range(len(points)):
+            if step == np.inf:
+                out[d, r] = np.inf
+                continue
+            k = nearest_sample(points, r, table, step)
+            dx, dy = points[r, 0] - table[k, X], points[r, 1] - table[k, Y]
+            along, across = dx * table[k, COS] + dy * table[k, SIN], dy * table[k, COS] - dx * table[k, SIN]
+            out[d, r] = across - 0.5 * table[k, BEND] * along**2
+    return out
+
+
+def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
+    """`check_course` of a posterior with a site `course`, for the report; nothing without a true line.
+
+    error_40_m ..       distance of the true course from the estimate at 40, 80 and 140 m
+    spread_40_m ..      its posterior standard deviation
+    inside_mid ..       1 where the estimate is inside the tube to 140 m
+    range_m             calibrated range
+    trusted_true        1 where the estimate is inside the mid tube up to there, 0 where not, nan for an abstention
+    coverage            share of the ranges where the 90 % band holds the truth"""
+    if scene.truth is None or "course" not in posterior.draws:
+        return {}
+    found = check_course(posterior, scene.truth["line"])
+    out: dict[str, float] = {}
+    for distance in TOLD:
+        i = found.at(distance)
+        out |= {f"error_{distance:.0f}_m": abs(found.error[i]), f"spread_{distance:.0f}_m": found.spread[i]}
+    out |= {f"inside_{tube}": float(found.inside(tube)) for tube in TUBES}
+    right = {"true": 1.0, "false": 0.0, "none": math.nan}[found.outcome]
+    return out | {"range_m": found.reach, "trusted_true": right, "coverage": float(found.covered.mean())}

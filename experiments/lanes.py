@@ -27,7 +27,7 @@ from inference.posterior import Posterior
 from models.intersection.course_family import AnyEvidence, Courses, centre_lines, lane_displacements
 from models.intersection.courses import LaneCourses
 from models.intersection.evidence import JunctionEvidence
-from models.intersection.routes import RoutedTracks, Routes, find_routes
+from models.intersection.routes import ROUTING, RoutedTracks, Routes, Routing, find_routes
 from models.intersection.same_lane import merge_routes
 from models.intersection.state import Junction
 from models.program import InputError
@@ -151,6 +151,7 @@ def refine_routes(
     refine: Engine,
     courses: Courses | Choice,
     seed: int,
+    routing: Routing = ROUTING,
 ) -> tuple[Posterior, AnyEvidence, Routes]:
     """From a structure and its routes to the courses; routes that are one lane are merged."""
     assert evidence.tracks is not None
@@ -158,7 +159,7 @@ def refine_routes(
     own = courses.own if isinstance(courses, Choice) else courses
     arms = own if isinstance(own, LaneCourses) else LaneCourses()
     prepared = arms.prepare(routed)
-    merged = merge_routes(prepared, routes, arms.spacing)
+    merged = merge_routes(prepared, routes, arms.spacing, routing)
     same = arms is own and len(merged.connections) == len(routes.connections)
     fitted = fit(refine, courses, routed._replace(routes=merged), seed, prepared if same else None)
     return fitted.posterior, fitted.evidence, merged

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from experiments.scenarios.protocol import protocol
 from experiments.scenarios.scene import JunctionTruth, Scene, join_tracks
-from models.intersection.routes import Routes, find_routes
+from models.intersection.routes import Routes, Routing, find_routes
 from models.intersection.state import Junction
 from models.intersection.tracks import Tracks
+from models.program import InputError
 from tests.test_junction_metrics import SLOTS, perfect
 
 MODEL = Junction()
@@ -102,3 +103,15 @@ def test_an_unnormalised_likelihood_is_refused() -> None:
     model = Junction(likelihood="half", bend_std=0.0)
     with pytest.raises(ValueError, match=r"^routes need likelihood 'exact', but this model has 'half'$"):
         find_routes(model, model.prepare(scene.data), estimate(scene.truth))
+
+
+def test_thresholds_act_and_must_be_positive() -> None:
+    """Vehicles that begin short of a half on their entry arm: ends count where a lane is close enough."""
+    scene = protocol(0, position_std=0.0)
+    short = [line[len(line) // 2 - 12 :] for line in singles(scene.data)]
+    tracks = join_tracks(short, None)
+    evidence = MODEL.prepare(tracks)
+    near, far = (find_routes(MODEL, evidence, estimate(scene.truth), Routing(close=close)) for close in (0.05, 4.0))
+    assert (near.track_route >= 0).sum() < (far.track_route >= 0).sum()
+    with pytest.raises(InputError, match="close of the routes must be positive, but is 0"):
+        Routing(close=0.0)

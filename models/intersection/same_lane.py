@@ -1,8 +1,8 @@
 """Routes that are one lane: tracks that were put on neighbouring lanes of an arm, but drove the same one.
 
-Both routes' tracks are laid along the first one's course; where no stretch of WINDOW metres finds them farther apart
-than SAME metres on average, they are one. Neighbouring lanes are about 3 m apart somewhere; of one lane, only the
-noise of the tracks and how its drivers keep off its middle lie between."""
+Both routes' tracks are laid along the first one's course; where no stretch of `window` metres finds them farther apart
+than `same` metres on average (Routing), they are one. Neighbouring lanes are about 3 m apart somewhere; of one lane,
+only the noise of the tracks and how its drivers keep off its middle lie between."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from models.intersection.course_evidence import CourseEvidence
 from models.intersection.course_kernel import sum_points
 from models.intersection.course_lines import lane_nodes
-from models.intersection.routes import Routes
+from models.intersection.routes import ROUTING, Routes, Routing
 
 Ints = NDArray[np.int64]
-WINDOW = 24.0  # [m] of a stretch
-SAME = 1.35  # [m]
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -47,7 +45,7 @@ def stretch_distance(one, other, span):  # type: ignore[no-untyped-def]
     return most if most >= 0.0 else np.inf
 
 
-def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float) -> Routes:
+def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float, routing: Routing = ROUTING) -> Routes:
     """The same routes, those that are one lane in one; the lane with more tracks gives its name."""
     connections, points = routes.connections, np.ascontiguousarray(evidence.points.numpy())
     size = np.bincount(routes.track_route[routes.track_route >= 0], minlength=len(connections))
@@ -55,7 +53,7 @@ def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float) -> Ro
     near &= (connections[:, None, ::2] == connections[None, :, ::2]).all(-1)
     if near.sum() == len(connections):  # every lane by itself
         return routes
-    becomes, span, courses = np.arange(len(connections)), round(WINDOW / spacing), lane_nodes(evidence, {})
+    becomes, span, courses = np.arange(len(connections)), round(routing.window / spacing), lane_nodes(evidence, {})
     of_lane = [evidence.tracks[a:b] for a, b in zip(evidence.starts[:-1], evidence.starts[1:], strict=True)]
     for i in np.argsort(-size, kind="stable"):
         own = None
@@ -64,7 +62,7 @@ def merge_routes(evidence: CourseEvidence, routes: Routes, spacing: float) -> Ro
                 continue
             own = lateral_sums(points, evidence.offsets, of_lane[i], courses[i]) if own is None else own
             theirs = lateral_sums(points, evidence.offsets, of_lane[j], courses[i])
-            if stretch_distance(own, theirs, span) < SAME:
+            if stretch_distance(own, theirs, span) < routing.same:
                 becomes[j] = i
     kept = np.flatnonzero(becomes == np.arange(len(becomes)))
     number = np.searchsorted(kept, becomes)

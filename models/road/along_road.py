@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from pyro.distributions import TorchDistribution
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.distributions import constraints
 
 from models.clothoid import Points, evaluate, hermite
@@ -74,8 +73,8 @@ class CuesAlongRoad(TorchDistribution):
 
 def scatter(points: Points, offset: Tensor, evidence: RoadEvidence, model: RoadCourse) -> Tensor:
     """Cues (*B, N, 3) seen beside points (*B, N) of a course at offsets (*B, N) [m], by torch's random numbers."""
-    noise = torch.randn((*offset.shape, 4))
-    clutter = torch.rand((*offset.shape, 3)) - 0.5  # which, where across, where to
+    noise = torch.randn((*offset.shape, 4), dtype=torch.float64)
+    clutter = torch.rand((*offset.shape, 3), dtype=torch.float64) - 0.5  # which, where across, where to
     clutter[..., 0] += 0.5
     is_clutter = clutter[..., 0] < model.clutter
     aside = torch.where(
@@ -130,11 +129,22 @@ class _LogProb(torch.autograd.Function):
         for i, z in enumerate(rows):
             cues = fixed or cue_arrays(model, evidence, seen[i].numpy())
             height[i] = -normal_equations(z, *natural(model), *cues, empty, slope[i])  # type: ignore[call-arg]
-        ctx.save_for_backward(torch.from_numpy(-slope).reshape(numbers.shape))
+        ctx.save_for_backward(numbers, torch.from_numpy(-slope).reshape(numbers.shape))
         return torch.from_numpy(height).reshape(numbers.shape[:-1])
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, height: Tensor) -> tuple[Tensor | None, ...]:
-        (slope,) = ctx.saved_tensors
-        return height[..., None] * slope, None, None, None
+        numbers, slope = ctx.saved_tensors
+        return _Slope.apply(height, numbers, slope), None, None, None
+
+
+class _Slope(torch.autograd.Function):
+    """The gradient, tied to the numbers it belongs to: its own derivative would else be zero without a word."""
+
+    @staticmethod
+    def forward(ctx: Any, height: Tensor, numbers: Tensor, slope: Tensor) -> Tensor:
+        return height[..., None] * slope
+
+    @staticmethod
+    def backward(ctx: Any, height: Tensor) -> tuple[Tensor | None, ...]:
+        raise RuntimeError("the density of cues along a road has first derivatives only; use RoadCourse.squares")

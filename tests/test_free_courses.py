@@ -106,6 +106,25 @@ def test_displacements_are_the_derivatives_of_the_nodes() -> None:
             np.testing.assert_allclose(nodes[:, 5 + p], numeric, atol=1e-8)
 
 
+def test_what_arms_share_moves_all_their_lanes_the_same_way() -> None:
+    """Entries and exits alike: the slope of an arm turns the outer ends of all its lanes to one side."""
+    first, connections = EVIDENCE.loc["offset"].size, EVIDENCE.connections
+    turned: dict[int, list[Array]] = {}
+    for lane, (reference, design, where) in enumerate(
+        zip(EVIDENCE.reference, EVIDENCE.design, EVIDENCE.where, strict=True)
+    ):
+        left = np.stack([-reference[:, 3], reference[:, 2]], 1)
+        for end, node in ((0, 5), (2, -6)):
+            arm = int(connections[lane, end])
+            slope = design[node, np.flatnonzero(where == first + 2 * arm)]
+            turned.setdefault(arm, []).append(slope * left[node])
+    for moves in turned.values():
+        assert len(moves) > 1
+        for move in moves[1:]:
+            np.testing.assert_allclose(move, moves[0], atol=0.15)  # of about 1 m
+    assert min(np.linalg.norm(moves[0]) for moves in turned.values()) > 0.5
+
+
 @BOTH
 def test_cost_gradient_and_hessian_are_those_of_single_points(routed: RoutedTracks) -> None:
     """Every point against the nearest of all nodes of its lane: J' J and J' r with a row for each residual."""

@@ -136,6 +136,6 @@ def flags(cues: Cues, moves: NDArray[np.bool_]) -> tuple[str, ...]:
     behind = int((cues.position[:, 0] < 0).sum())
     if behind == num:
         found.append("all cues are behind the car: the road ahead is its prior")
-    elif behind:
+    elif 2 * behind > num:
         found.append(f"{behind} of {num} cues are behind the car: they say little about the road ahead")
     return tuple(found)

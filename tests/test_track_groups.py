@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from models.intersection.between_lanes import in_between
 from models.intersection.laid_tracks import BIN, WINDOW, distances, lay, ways
-from models.intersection.track_groups import group_tracks
+from models.intersection.track_groups import from_group, group_tracks
 from models.intersection.tracks import Tracks
 from models.intersection.traffic_lanes import find_lanes
 from models.program import InputError
@@ -139,6 +139,14 @@ def test_profiles_that_part_in_one_bin_are_infinitely_far() -> None:
     away = total.copy()
     away[0, 2] = 6.0 * 5.0
     assert distances(full, total, full, away, 0.3)[0][0] == np.inf
+
+
+def test_a_track_is_compared_with_the_others_of_its_group() -> None:
+    """Two tracks 1 m apart: either is 1 m from the other, not half of it from their mean."""
+    every = ways(noisy([EAST[0], EAST[0] + np.array([0, 1.0])], std=0.0))
+    laid = lay(every, EAST[0])
+    assert from_group(laid, np.array([0, 0]), 0, 0.0)[0] == pytest.approx([1.0, 1.0])
+    assert from_group(laid, np.array([0, 1]), 0, 0.0)[0].tolist() == [np.inf, pytest.approx(1.0)]
 
 
 def test_a_track_lies_where_it_is_beside_a_curve() -> None:

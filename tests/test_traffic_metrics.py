@@ -60,6 +60,7 @@ def test_a_lane_of_the_other_direction_is_not_near() -> None:
 def test_points_beyond_the_end_of_the_map_are_left_out() -> None:
     scores = score(found(straight((20, 0), (90, 0))), drawn_map(EAST), TRACKS)
     assert scores["traffic_p90_m"] == pytest.approx(0.0, abs=1e-9) and scores["traffic_precision_1m"] == 1.0
+    assert scores["traffic_arms_precision_1m"] == 1.0
 
 
 def test_recall_asks_for_driven_lanes_only() -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
+from benchmarks.configured import configured as configured_part
+from benchmarks.configured import quiet_engine
 from experiments.junction_metrics import structure
 from experiments.scenarios.scene import Scene
 from inference import rjmcmc
@@ -73,27 +74,16 @@ ANNEALED = {"num_chains": NUM_CHAINS, "num_steps": 2500, "warmup": 2500, "start"
 DEFAULT = Setting(Junction(), ANNEALED | {"polish": True})
 
 
-@lru_cache
 def configured(name: str) -> Junction:
     """The model of the config model=NAME."""
-    from hydra import compose, initialize_config_module
-    from hydra.utils import instantiate
-
-    with initialize_config_module("configs", version_base="1.3"):
-        model = instantiate(compose("run", [f"model={name}"]).model)
+    model = configured_part("model", name)
     assert isinstance(model, Junction)
     return model
 
 
-@lru_cache
 def configured_engine(name: str) -> Callable[..., Posterior]:
     """The engine of the config engine=NAME, without a progress bar."""
-    from hydra import compose, initialize_config_module
-    from hydra.utils import instantiate
-
-    with initialize_config_module("configs", version_base="1.3"):
-        engine = instantiate(compose("run", [f"engine={name}"]).engine, _convert_="all")
-    return partial(engine, progress=False)
+    return quiet_engine(name)
 
 
 def m20(likelihood: Literal["half", "point"] = "half", acceptance: Literal["paper", "printed"] = "paper") -> Setting:

@@ -1,0 +1,27 @@
+"""Models and engines as the configs have them: what a figure tells is what a user gets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
+from inference.posterior import Posterior
+
+
+@lru_cache
+def configured(group: str, name: str) -> Any:
+    """What the config GROUP=NAME makes: a model, or an engine that waits for its arguments."""
+    from hydra import compose, initialize_config_module
+    from hydra.utils import instantiate
+
+    with initialize_config_module("configs", version_base="1.3"):
+        return instantiate(compose("run", [f"{group}={name}"])[group], _convert_="all")
+
+
+def quiet_engine(name: str, **knobs: Any) -> Callable[..., Posterior]:
+    """The engine of the config engine=NAME with further knobs, without a progress bar."""
+    engine = configured("engine", name)
+    if "progress" in engine.keywords:
+        knobs["progress"] = False
+    return partial(engine, **knobs)

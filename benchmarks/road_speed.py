@@ -1,0 +1,102 @@
+"""How long engines take on one road, and what a step of Pyro's own variational inference takes."""
+
+from __future__ import annotations
+
+import time
+from statistics import median
+from typing import Any
+
+from benchmarks.clothoid import FIGURES as CLOTHOID
+from benchmarks.clothoid import measure as clothoid
+from benchmarks.configured import quiet_engine
+from benchmarks.figure import Figure, Measurement, Value, Values
+from benchmarks.road_trials import MODEL, Effort, drive, frozen
+
+ENGINES: dict[str, tuple[str, dict[str, Any], float]] = {
+    "ms_lm": ("least_squares", {}, 1.0),
+    "ms_bbvi": ("bbvi", {"num_samples": 64, "num_steps": 15, "num_snapshots": 0}, 10.0),
+    "ms_ais": ("importance", {}, 15.0),
+    "ms_obbvi": ("bbvi_overdispersed", {"num_snapshots": 0}, 40.0),
+}
+PARTICLES = 64
+STEPS = 100
+
+
+def times(effort: Effort) -> Values:
+    values = {}
+    for key, (name, knobs, _) in ENGINES.items():
+        trials = drive(quiet_engine(name, **knobs), frozen(effort.scenes)[: effort.timed], key, effort.timed, False)
+        spent = sorted(trial.ms for trial in trials)
+        values[key] = Value(median(spent), f"n = {len(spent)}, {spent[0]:.2f} to {spent[-1]:.2f}")
+    return values
+
+
+TIMES = Measurement(
+    tuple(
+        Figure(
+            key,
+            "ms",
+            f"processor time from evidence to posterior, {' '.join([name, *(f'{k}={v}' for k, v in knobs.items())])}: "
+            "one thread, warm, median over frozen scenes",
+            at_most=most,
+        )
+        for key, (name, knobs, most) in ENGINES.items()
+    ),
+    times,
+)
+
+
+def pyro_step(effort: Effort) -> Values:
+    """Both fit a mean-field Gaussian by reparameterised gradients of as many draws."""
+    import pyro
+    import torch
+    from pyro.infer import SVI, Trace_ELBO
+    from pyro.infer.autoguide import AutoNormal
+    from pyro.optim import Adam
+
+    from models.program import quiet_doubles
+
+    evidence = MODEL.prepare(frozen(effort.scenes)[0].data)
+    with quiet_doubles(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        pyro.clear_param_store()
+        loss = Trace_ELBO(num_particles=PARTICLES, vectorize_particles=True, max_plate_nesting=0)
+        svi = SVI(MODEL, AutoNormal(MODEL), Adam({"lr": 0.01}), loss)
+        spent = []
+        for _ in range(STEPS // 4 + 1):
+            began = time.process_time()
+            svi.step(evidence)
+            spent.append(1e3 * (time.process_time() - began))
+        pyro.clear_param_store()
+    theirs = median(spent[1:])  # the first makes the guide
+    knobs = {"estimator": "reparameterised", "num_samples": PARTICLES, "num_snapshots": 0}
+    ours = []
+    for _ in range(5):
+        lengths = []
+        for steps in (1, 1 + STEPS):
+            began = time.process_time()
+            quiet_engine("bbvi", num_steps=steps, **knobs)(MODEL, evidence, seed=0)
+            lengths.append(1e3 * (time.process_time() - began))
+        ours.append((lengths[1] - lengths[0]) / STEPS)
+    return {"pyro_step_ratio": Value(theirs / median(ours), f"{theirs:.1f} ms / {median(ours):.2f} ms")}
+
+
+PYRO = Measurement(
+    (
+        Figure(
+            "pyro_step_ratio",
+            "",
+            f"processor time of one step of Pyro's SVI (AutoNormal, vectorised) over ours, same model and evidence, "
+            f"{PARTICLES} reparameterised draws",
+            at_least=20.0,
+        ),
+    ),
+    pyro_step,
+)
+
+
+def fits(effort: Effort) -> Values:
+    return clothoid()
+
+
+MEASUREMENTS = (TIMES, PYRO, Measurement(CLOTHOID, fits))

@@ -28,7 +28,6 @@ SCENE = protocol(14, max_lanes=2)
 ROUTED = true_routes(SCENE)
 EVIDENCE = MODEL.prepare(ROUTED)
 TURNED = true_routes(protocol(14, max_lanes=2, heading_std=0.1))
-BOTH = pytest.mark.parametrize("routed", [ROUTED, TURNED], ids=["positions", "headings"])
 
 
 def bare(lines: list[Array], connections: list[tuple[int, int, int, int]], seed: int, tracks: int = 4) -> RoutedTracks:
@@ -43,6 +42,11 @@ def arc(radius: float, turn: float, arms: float = 40.0) -> Array:
     outer = np.arange(0.0, arms, 0.25)
     heading = np.concatenate([np.zeros(len(outer)), inner / radius, np.full(len(outer), turn)])
     return 0.25 * np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
+
+
+BESIDE = arc(1e6, 2e-5, 40.0) - np.array([0.0, 3.0])
+BACK = bare([arc(7.0, math.pi), BESIDE], [(0, 0, 0, 0), (0, 1, 1, 0)], 0)  # both stubs of the first share an arm
+EVERY = pytest.mark.parametrize("routed", [ROUTED, TURNED, BACK], ids=["positions", "headings", "u-turn"])
 
 
 def estimate(model: FreeCourses, evidence: FreeEvidence) -> tuple[list[Array], list[Array], list[Array]]:
@@ -125,7 +129,7 @@ def test_what_arms_share_moves_all_their_lanes_the_same_way() -> None:
     assert min(np.linalg.norm(moves[0]) for moves in turned.values()) > 0.5
 
 
-@BOTH
+@EVERY
 def test_cost_gradient_and_hessian_are_those_of_single_points(routed: RoutedTracks) -> None:
     """Every point against the nearest of all nodes of its lane: J' J and J' r with a row for each residual."""
     evidence = MODEL.prepare(routed)
@@ -161,7 +165,7 @@ def test_cost_gradient_and_hessian_are_those_of_single_points(routed: RoutedTrac
     np.testing.assert_allclose(gradient, jacobian.T @ residual, atol=1e-8 * np.abs(gradient).max())
 
 
-@BOTH
+@EVERY
 def test_log_joint_is_that_of_the_squares(routed: RoutedTracks) -> None:
     evidence = MODEL.prepare(routed)
     check(MODEL, evidence)

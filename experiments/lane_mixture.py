@@ -21,24 +21,24 @@ from numpy.typing import NDArray
 
 from experiments.scenarios.paths import beside
 from models.intersection.course_lines import edges
+from models.intersection.routes import Routes
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class ReadLanes(NamedTuple):
     """The L lanes of one reading.
 
-    share        of the reading
-    lines        L centre lines (n, 2) [m]
-    across       L arrays (n, D): how far to the left of them the lines of its draws run [m]; D in proportion to share
-    track_route  (T,) lane of every track, -1 for none
+    share   of the reading
+    lines   L centre lines (n, 2) [m]
+    across  L arrays (n, D): how far to the left of them the lines of its draws run [m]; D in proportion to share
+    routes  their entries and exits, and which track drove which lane
     """
 
     share: float
     lines: list[Array]
     across: list[Array]
-    track_route: Ints
+    routes: Routes
 
 
 class Alternative(NamedTuple):
@@ -76,14 +76,14 @@ def mix(readings: Sequence[ReadLanes], level: float) -> Mixture:
     further: list[Alternative] = []
     for number, other in enumerate(readings[1:], start=1):
         for match in range(len(other.lines)):
-            tracks = other.track_route == match
-            lane = next((i for i in range(len(best.lines)) if is_same(best.track_route == i, tracks)), None)
+            tracks = other.routes.track_route == match
+            lane = next((i for i in range(len(best.lines)) if is_same(best.routes.track_route == i, tracks)), None)
             if lane is not None:
                 probability[lane] += other.share
                 offset, place = beside(best.lines[lane], other.lines[match])
                 samples[lane].append(offset[:, None] + other.across[match][np.rint(place).astype(int)])
                 continue
-            theirs = (readings[a.reading].track_route == a.lane for a in further)
+            theirs = (readings[a.reading].routes.track_route == a.lane for a in further)
             known = next((i for i, those in enumerate(theirs) if is_same(those, tracks)), None)
             if known is None:
                 further.append(Alternative(other.share, number, match))

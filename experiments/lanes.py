@@ -34,6 +34,7 @@ from models.program import InputError
 
 Engine = Callable[..., Posterior]
 Array = NDArray[np.float64]
+Refined = tuple[Posterior, AnyEvidence, Routes]
 BAND = 0.9  # posterior probability between the edges of a band
 NUM_DRAWS = 1000  # of lines, over all readings
 
@@ -72,28 +73,40 @@ def with_lanes(
     began = time.perf_counter()
     posterior, course_evidence, routes = refine_lanes(model, evidence, found, refine, courses, seed)
     readings = read(model, evidence, found)
-    best = _lanes_of(readings.kept[0].share, posterior, course_evidence, routes, seed)
-    others = [_refined(model, evidence, reading, refine, courses, seed) for reading in readings.kept[1:]]
-    mixture = mix([best, *(lanes for lanes, _ in others)], BAND)
+    arguments = (refine, courses, seed)
+    seen: list[tuple[Reading, Refined | None]] = [(readings.kept[0], (posterior, course_evidence, routes))]
+    for reading in readings.kept[1:]:
+        some = len(reading.routes.connections) > 0
+        seen.append(
+            (reading, refine_routes(model, evidence, reading.state, reading.routes, *arguments) if some else None)
+        )
+    sound = [seen[0], *filter(_is_sound, seen[1:])]
+    total = sum(reading.share for reading, _ in sound)
+    lanes_of = [_lanes_of(reading.share / total, reading, refined, seed) for reading, refined in sound]
+    best, mixture = lanes_of[0], mix(lanes_of, BAND)
     flags = [*found.info.get("flags", []), *posterior.info.get("flags", []), *readings.flags]
+    if len(sound) < len(seen):
+        flags.append(
+            f"the courses of {len(seen) - len(sound)} of {len(seen)} readings of the tracks, {1 - total:.0%} of their "
+            "draws, did not converge: bands and probabilities leave them out"
+        )
     families = {key: value for key, value in posterior.info.items() if key.startswith("family")}
     info = (
         found.info
         | families
         | {
             "lanes": len(best.lines),
-            "readings": len(readings.kept),
-            "readings_share": readings.covered,
+            "readings": len(sound),
+            "readings_share": readings.covered * total,
             "lane_seconds": time.perf_counter() - began,
             "flags": flags,
         }
     )
     alternatives = []
     for probability, number, lane in mixture.alternatives:
-        lanes, own = others[number - 1]
-        tracks = int((own.track_route == lane).sum())
-        ends, state = own.connections[lane], readings.kept[number].state
-        alternatives.append(OtherLane(probability, lanes.lines[lane], ends, state, tracks))
+        own, state = lanes_of[number], sound[number][0].state
+        tracks = int((own.routes.track_route == lane).sum())
+        alternatives.append(OtherLane(probability, own.lines[lane], own.routes.connections[lane], state, tracks))
     fields = {name: getattr(found, name) for name in found.__dataclass_fields__}
     return LanePosterior(
         **fields | {"info": info},
@@ -106,26 +119,19 @@ def with_lanes(
     )
 
 
-def _refined(
-    model: Junction,
-    evidence: JunctionEvidence,
-    reading: Reading,
-    refine: Engine,
-    courses: Courses | Choice,
-    seed: int,
-) -> tuple[ReadLanes, Routes]:
-    """The lanes of a reading; none where no track is on a route."""
-    if len(reading.routes.connections) == 0:
-        return ReadLanes(reading.share, [], [], reading.routes.track_route), reading.routes
-    refined = refine_routes(model, evidence, reading.state, reading.routes, refine, courses, seed)
-    return _lanes_of(reading.share, *refined, seed), refined[2]
+def _is_sound(seen: tuple[Reading, Refined | None]) -> bool:
+    """Whether the courses of a reading converged: a Laplace posterior is one at a minimum only."""
+    return seen[1] is None or bool(seen[1][0].info.get("converged", True))
 
 
-def _lanes_of(share: float, posterior: Posterior, evidence: AnyEvidence, routes: Routes, seed: int) -> ReadLanes:
-    """Lines of the estimate, and draws of them in proportion to the share of the reading."""
+def _lanes_of(share: float, reading: Reading, refined: Refined | None, seed: int) -> ReadLanes:
+    """Lines of the estimate, and draws of them in proportion to the share; no lanes where no track is on a route."""
+    if refined is None:
+        return ReadLanes(share, [], [], reading.routes)
+    posterior, evidence, routes = refined
     draws = posterior.resample(max(round(share * NUM_DRAWS), 1), seed)
     across = lane_displacements(evidence, posterior.estimate, draws)
-    return ReadLanes(share, centre_lines(evidence, posterior.estimate), across, routes.track_route)
+    return ReadLanes(share, centre_lines(evidence, posterior.estimate), across, routes)
 
 
 def refine_lanes(
@@ -135,7 +141,7 @@ def refine_lanes(
     refine: Engine,
     courses: Courses | Choice,
     seed: int,
-) -> tuple[Posterior, AnyEvidence, Routes]:
+) -> Refined:
     """From the best state of a structure to the courses: their posterior, what it was learnt from, the routes."""
     if evidence.tracks is None:
         raise InputError("lanes need whole tracks, but this evidence was simulated half by half")
@@ -152,7 +158,7 @@ def refine_routes(
     courses: Courses | Choice,
     seed: int,
     routing: Routing = ROUTING,
-) -> tuple[Posterior, AnyEvidence, Routes]:
+) -> Refined:
     """From a structure and its routes to the courses; routes that are one lane are merged."""
     assert evidence.tracks is not None
     routed = RoutedTracks(evidence.tracks, whole_structure(model, state), routes)

@@ -23,6 +23,7 @@ from inference.posterior import Posterior
 from models.intersection.course_lines import edges
 from models.intersection.courses import LaneCourses
 from models.intersection.packing import FIELDS
+from models.intersection.routes import Routes
 from models.intersection.state import Junction
 
 X = np.arange(0.0, 50.0)
@@ -40,7 +41,8 @@ def spread(std: float, num: int) -> np.ndarray:
 def lanes(share: float, places: list[float], std: float, track_route: list[int]) -> ReadLanes:
     num = round(share * 1000)
     lines = [straight(y) for y in places]
-    return ReadLanes(share, lines, [spread(std, num) for _ in lines], np.array(track_route))
+    routes = Routes(np.zeros((len(lines), 4), dtype=np.int64), np.array(track_route))
+    return ReadLanes(share, lines, [spread(std, num) for _ in lines], routes)
 
 
 BEST = lanes(0.7, [0.0, 3.0, 6.0], 0.1, [0, 0, 0, 1, 1, 1, 2, -1])
@@ -80,7 +82,9 @@ def test_the_order_of_readings_and_of_their_lanes_changes_nothing() -> None:
     shuffled = OTHER._replace(
         lines=[OTHER.lines[i] for i in order],
         across=[OTHER.across[i] for i in order],
-        track_route=np.array([order.index(lane) if lane >= 0 else -1 for lane in OTHER.track_route]),
+        routes=OTHER.routes._replace(
+            track_route=np.array([order.index(lane) if lane >= 0 else -1 for lane in OTHER.routes.track_route])
+        ),
     )
     one, other = mix(readings, 0.9), mix([readings[0], third, shuffled], 0.9)
     assert one.probability == pytest.approx([1.0, 0.8, 0.5])
@@ -176,6 +180,18 @@ def test_the_order_of_draws_and_of_slots_changes_nothing(found: LanePosterior) -
     np.testing.assert_allclose(again.probability, found.probability)
     for one, other in zip(again.lanes.left + again.lanes.right, found.lanes.left + found.lanes.right, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+def test_readings_whose_courses_did_not_converge_are_left_out_and_flagged() -> None:
+    def lost(*arguments: Any, **knobs: Any) -> Posterior:
+        fitted = REFINE(*arguments, **knobs)
+        missing = len(fitted.estimate["angle"]) < len(SCENE.truth.angle)
+        return replace(fitted, info=fitted.info | {"converged": not missing})
+
+    found = with_lanes(MODEL, EVIDENCE, posterior_of(ten_draws()), lost, LaneCourses(inner_wave_std=0.0), 0)
+    assert found.info["readings"] == 1 and found.info["readings_share"] == pytest.approx(0.7)
+    assert found.probability == pytest.approx(1.0)
+    assert any("30% of their draws, did not converge" in flag for flag in found.info["flags"])
 
 
 def test_a_best_state_that_no_draw_is_like_counts_as_one_more() -> None:

@@ -119,7 +119,8 @@ def run(
         scalars = collect("functional", functionals, posterior)
         judged = replace(posterior, draws=posterior.draws | scalars)
         found = attempt("diagnostics", lambda: {"summary": diagnostics.summary(judged)})
-        found |= attempt("flags", lambda: {"flags": diagnostics.flags(judged)})
+        poor = list(getattr(evidence, "flags", ()))  # what the model says against its evidence
+        found |= attempt("flags", lambda: {"flags": poor + diagnostics.flags(judged)})
     with stage("figures"):
         drawn = collect("figure", figures, posterior, scene)
     return Result(scene, posterior, scores, found.get("summary", {}), found.get("flags", []), drawn, seconds, failures)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from experiments.run import run
 from experiments.scenarios.road import night_road
+from experiments.scenarios.scene import Scene
 from inference import least_squares
 from models.clothoid import Clothoid, evaluate
 from models.program import InputError, check
@@ -133,6 +136,12 @@ def test_poor_evidence_is_flagged_and_its_posterior_honestly_wide(
     posterior = least_squares.run(MODEL, found, seed=0, num_draws=1000)
     assert posterior.info["converged"]
     assert posterior.sd("course")[4] > 10.0
+
+
+def test_a_run_shows_what_speaks_against_its_evidence() -> None:
+    scene = Scene(cues(("pole", True, 1, 30, 6)), None, "one pole", {})
+    result = run(lambda: scene, MODEL, partial(least_squares.run, num_draws=100))
+    assert result.flags[0] == "there is only one cue: the course is little more than its prior"
 
 
 def test_noise_along_the_line_of_sight_is_along_it() -> None:

@@ -27,7 +27,6 @@ import time
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from inference import weights
@@ -46,8 +45,9 @@ from inference.gradients import (
 )
 from inference.posterior import Posterior, Snapshots
 from inference.progress import Progress
+from inference.snapshots import snapshots
 from inference.transform import Target, whitening
-from models.program import InputError, Model, log_joint
+from models.program import InputError, Model
 
 Array = NDArray[np.float64]
 ESTIMATORS = ("score", "overdispersed", "reparameterised")
@@ -306,15 +306,10 @@ def _posterior(
         log_evidence=weights.log_mean(log_weights),
         estimate=plan.target.latents(q.mean),
         info=info,
-        snapshots=_snapshots(plan, *trace),
+        snapshots=_snapshots(plan, *trace) if trace[2] else None,
     )
 
 
-def _snapshots(plan: Plan, model: Model, evidence: Any, shots: list[tuple[int, float, Array]]) -> Snapshots | None:
-    if not shots:
-        return None
+def _snapshots(plan: Plan, model: Model, evidence: Any, shots: list[tuple[int, float, Array]]) -> Snapshots:
     steps, seconds, numbers = zip(*shots, strict=True)
-    states = plan.target.latents(np.stack(numbers)[:, : plan.target.size])
-    rows = ({name: torch.as_tensor(value[i]) for name, value in states.items()} for i in range(len(steps)))
-    heights = [float(log_joint(model, row, evidence)) for row in rows]  # one by one: plates bear no flat batch
-    return Snapshots(np.array(steps), np.array(seconds), np.array(heights), states)
+    return snapshots(model, evidence, steps, seconds, plan.target.latents(np.stack(numbers)[:, : plan.target.size]))

@@ -1,4 +1,4 @@
-"""The continuous part of an intersection, its structure fixed, by variational inference through the program."""
+"""Intersections by variational inference: the continuous part with its structure fixed, and the courses of lanes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from inference import bbvi
+from inference import bbvi, least_squares
 from inference.factors import factored
+from models.intersection.courses import LaneCourses
 from models.program import Fixed, InputError, fix, simulate
 from tests.small_junction import FULL, NOTHING, blank_evidence, one, with_points
+from tests.small_lanes import small_scene, true_routes
 
 ARMS = torch.tensor(3)
 
@@ -54,3 +56,16 @@ def test_bbvi_finds_the_centre_and_the_arms_of_a_fixed_structure(
 def test_an_open_structure_is_refused_by_name(scene: tuple[Fixed, Any, dict[str, torch.Tensor]]) -> None:
     with pytest.raises(InputError, match="'num_arms' is Categorical; fix\\(\\) it first"):
         bbvi.run(FULL, scene[1], seed=0)
+
+
+def test_lane_courses_are_those_of_least_squares() -> None:
+    """Whose Laplace posterior is nearly exact there: means within a standard deviation, widths within a fifth."""
+    model = LaneCourses()
+    evidence = model.prepare(true_routes(small_scene()))
+    near = least_squares.run(model, evidence, seed=0)
+    knobs: dict[str, Any] = {"estimator": "reparameterised", "num_steps": 60, "num_samples": 16, "num_snapshots": 0}
+    posterior = bbvi.run(model, evidence, seed=0, **knobs)
+    for site, draws in near.draws.items():
+        if draws.size:
+            assert np.abs((posterior.mean(site) - near.mean(site)) / near.sd(site)).max() < 1.0
+            assert np.median(posterior.sd(site) / near.sd(site)) == pytest.approx(1.0, abs=0.2)

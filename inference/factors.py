@@ -1,8 +1,9 @@
 """Any model as a whitened product of factors (models.capability.Factors), for engines that evaluate batches.
 
-A model with factors() hands over its compiled ones. Any other program is read through models.whitening.bind: one
-factor for each observed site, which may depend on every number; values and gradients come from torch. Where torch
-cannot see through a compiled density, gradients are central differences, at the price of 2 D values.
+A model with factors() hands over its compiled ones; a compiled sum of squares is one factor (inference.squared). Any
+other program is read through models.whitening.bind: one factor for each observed site, which may depend on every
+number; values and gradients come from torch. Where torch cannot see through a compiled density, gradients are central
+differences, at the price of 2 D values.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.capability import Factors, HasFactors
+from inference.squared import squared
+from models.capability import Factors, HasFactors, HasSquares
 from models.program import Latents, Model
 from models.whitening import Bound, bind
 
@@ -28,6 +30,8 @@ def factored(model: Model, evidence: Any) -> Factors:
     Raises InputError by name for a latent that no map of normal numbers reaches, such as a discrete one."""
     if isinstance(model, HasFactors):
         return model.factors(evidence)
+    if isinstance(model, HasSquares):
+        return squared(model.squares(evidence))
     bound = bind(model, evidence)
     ends = np.cumsum([0, *(shape.numel() for shape in bound.shapes.values())])
     sites = {name: slice(int(a), int(b)) for name, a, b in zip(bound.shapes, ends[:-1], ends[1:], strict=True)}

@@ -20,15 +20,15 @@ import time
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from inference import weights
 from inference.factors import factored
-from inference.posterior import Posterior, Snapshots
+from inference.posterior import Posterior
+from inference.snapshots import snapshots
 from inference.transform import Target, whitening
-from models.program import InputError, Model, log_joint
+from models.program import InputError, Model
 
 Array = NDArray[np.float64]
 DEGREES = 5.0  # of freedom of the proposals
@@ -141,22 +141,24 @@ def run(
     log_weights = rounds.height - rounds.mixed + math.log(num_rounds)
     later = (rounds.height - rounds.own)[num_draws * (num_rounds // 2) :]
     pareto_k = weights.pareto_k(log_weights)
-    snapshots = _snapshots(model, evidence, target, rounds, num_draws, times)
+    seconds, draws = time.perf_counter() - began, target.latents(rounds.u)
+    ends = num_draws * np.arange(1, num_rounds + 1)
+    best = [int(rounds.height[:end].argmax()) for end in ends]
     return Posterior(
-        draws={n: v[None] for n, v in target.latents(rounds.u).items()},
+        draws={n: v[None] for n, v in draws.items()},
         log_weights=log_weights[None],
         log_evidence=weights.log_mean(later),
-        estimate={n: v[-1] for n, v in snapshots.states.items()},
+        estimate={n: v[best[-1]] for n, v in draws.items()},
         info={
             "engine": "importance",
-            "seconds": time.perf_counter() - began,
+            "seconds": seconds,
             "evaluations": evaluations + len(rounds.u),
             "ess": weights.effective_size(log_weights),
             "pareto_k": pareto_k,
             "log_evidence_error": weights.relative_error(later),
             "flags": flags + _flags(pareto_k),
         },
-        snapshots=snapshots,
+        snapshots=snapshots(model, evidence, ends.tolist(), times, {n: v[best] for n, v in draws.items()}),
     )
 
 
@@ -167,13 +169,3 @@ def _flags(pareto_k: float) -> list[str]:
         f"the Pareto shape of the weights is {pareto_k:.2f} (above {WORST_K}): few draws bear all weight, so means and "
         "evidence cannot be trusted; raise num_rounds, use transform=laplace, or use smc"
     ]
-
-
-def _snapshots(
-    model: Model, evidence: Any, target: Target, rounds: Rounds, num_draws: int, times: list[float]
-) -> Snapshots:
-    """The best draw of all rounds so far, after every round."""
-    ends = num_draws * np.arange(1, len(times) + 1)
-    states = target.latents(rounds.u[[int(rounds.height[:end].argmax()) for end in ends]])
-    heights = log_joint(model, {n: torch.as_tensor(v) for n, v in states.items()}, evidence)
-    return Snapshots(ends, np.array(times), heights.numpy(), states)

@@ -20,16 +20,16 @@ import time
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from inference import weights
 from inference.factors import factored
 from inference.population import Movers, Population, Walkers
-from inference.posterior import Posterior, Snapshots
+from inference.posterior import Posterior
 from inference.progress import Progress, announce
+from inference.snapshots import snapshots
 from inference.transform import whitening
-from models.program import InputError, Model, log_joint
+from models.program import InputError
 
 Array = NDArray[Any]
 FEW = 20.0  # families below which a population has forgotten its beginnings
@@ -74,7 +74,7 @@ def run(
     else:
         population, evaluations, flags = _walkers(model, evidence, init, transform, num_particles, num_moves, first)
     exponents, log_evidence, families = [0.0], 0.0, np.arange(num_particles)
-    shots = [(0.0, population.best())]
+    times, states = [time.perf_counter() - began], [population.best()]
     with Progress("tempering", 100, progress) as bar:
         while exponents[-1] < 1.0:
             heat, left = population.heat, 1.0 - exponents[-1]
@@ -85,7 +85,8 @@ def run(
             population.choose(index)
             families = families[index]
             population.move(exponents[-1])
-            shots.append((time.perf_counter() - began, population.best()))
+            times.append(time.perf_counter() - began)
+            states.append(population.best())
             bar.advance(round(100 * _share_done(exponents)) - bar.done)
     shares = np.bincount(families) / num_particles
     draws, dimension = population.draws(), getattr(model, "dimension", None)
@@ -94,10 +95,10 @@ def run(
         draws={n: v[None] for n, v in draws.items()},
         log_evidence=log_evidence,
         model_index=draws[dimension][None] if dimension else None,
-        estimate=shots[-1][1],
+        estimate=states[-1],
         info={
             "engine": "smc",
-            "seconds": time.perf_counter() - began,
+            "seconds": times[-1],
             "evaluations": evaluations + population.evaluations,
             "acceptance": population.acceptance,
             "exponents": exponents,
@@ -105,7 +106,7 @@ def run(
             "log_evidence_error": math.sqrt(max(1.0 / num_families - 1.0 / num_particles, 0.0)),
             "flags": flags + _flags(num_families, num_particles),
         },
-        snapshots=_snapshots(model, evidence, shots),
+        snapshots=snapshots(model, evidence, range(len(states)), times, _stack(states)),
     )
 
 
@@ -157,7 +158,5 @@ def _flags(num_families: float, num_particles: int) -> list[str]:
     ]
 
 
-def _snapshots(model: Model, evidence: Any, shots: list[tuple[float, dict[str, Array]]]) -> Snapshots:
-    states = {n: np.stack([state[n] for _, state in shots]) for n in shots[0][1]}
-    heights = log_joint(model, {n: torch.as_tensor(v) for n, v in states.items()}, evidence)
-    return Snapshots(np.arange(len(shots)), np.array([seconds for seconds, _ in shots]), heights.numpy(), states)
+def _stack(states: list[dict[str, Array]]) -> dict[str, Array]:
+    return {n: np.stack([state[n] for state in states]) for n in states[0]}

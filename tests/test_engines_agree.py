@@ -7,12 +7,13 @@ from ArviZ, and that of a standard deviation from the mean of squared deviations
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from inference import bbvi, diagnostics, least_squares, rjmcmc
+from inference import bbvi, diagnostics, importance, least_squares, nuts, rjmcmc, smc
 from inference.posterior import Posterior
 from models.program import simulate
 from models.toys.gaussian import ConjugateGaussian, Readings
@@ -21,10 +22,20 @@ MODEL = ConjugateGaussian(step=0.8)
 BLANK = Readings(torch.linspace(-1.0, 1.0, 20, dtype=torch.float64), None)
 EVIDENCE = BLANK._replace(y=simulate(MODEL, BLANK, num=1, seed=3)["y"][0])
 
+
+def even(posterior: Posterior) -> Posterior:
+    """As many draws of equal weight as the weighted ones are worth."""
+    draws = posterior.resample(int(posterior.info["ess"]), seed=0)
+    return replace(posterior, draws={n: v[None] for n, v in draws.items()}, log_weights=None)
+
+
 ENGINES: dict[str, Callable[[], Posterior]] = {
     "bbvi": lambda: bbvi.run(MODEL, EVIDENCE, seed=1, estimator="reparameterised", num_draws=4000),
+    "importance": lambda: even(importance.run(MODEL, EVIDENCE, seed=1, num_draws=500)),
     "least_squares": lambda: least_squares.run(MODEL, EVIDENCE, seed=1, num_draws=4000),
+    "nuts": lambda: nuts.run(MODEL, EVIDENCE, seed=1, num_chains=2, num_draws=200, warmup=60),
     "rjmcmc": lambda: rjmcmc.run(MODEL, EVIDENCE, seed=1, num_chains=20, num_steps=1500, warmup=300),
+    "smc": lambda: smc.run(MODEL, EVIDENCE, seed=1),
 }
 
 
@@ -73,3 +84,6 @@ def test_estimates_of_the_evidence_are_exact() -> None:
     assert ENGINES["least_squares"]().log_evidence == pytest.approx(float(log_evidence), abs=1e-8)
     found = ENGINES["bbvi"]()
     assert found.log_evidence == pytest.approx(float(log_evidence), abs=4 * found.info["elbo_error"])
+    for name in ("importance", "smc"):
+        found = ENGINES[name]()
+        assert found.log_evidence == pytest.approx(float(log_evidence), abs=4 * found.info["log_evidence_error"])

@@ -61,8 +61,8 @@ def names(quality: str | None = None, data_root: str = DATA_ROOT) -> list[str]:
     return [name for name, file in files.items() if quality in (None, json.loads(file.read_text())["quality"])]
 
 
-def find(data_root: str, kind: str, ending: str) -> dict[str, Path]:
-    """Files of one kind below the data folder by their name, sorted.
+def find(data_root: str, kind: str, ending: str, instead: str = "protocol") -> dict[str, Path]:
+    """Files of one kind below the data folder by their name, sorted; `instead` is a scenario without files.
 
     Raises InputError that says where it looked and what to do."""
     folder = Path(data_root) / kind
@@ -70,7 +70,7 @@ def find(data_root: str, kind: str, ending: str) -> dict[str, Path]:
     if not files:
         raise InputError(
             f"no {kind} in '{folder.resolve()}'; set scenario.data_root to the folder that holds "
-            f"'{kind}', or run scenario=protocol, which needs no files"
+            f"'{kind}', or run scenario={instead}, which needs no files"
         )
     return files
 

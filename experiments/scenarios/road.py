@@ -154,16 +154,19 @@ def see(layout: Layout, line: Line, rng: np.random.Generator, noise: np.random.S
     aside, points = offset[evidence.group], line.at(np.array(layout.arc))
     x, y, heading = (v.numpy() for v in points[:3])
     true = np.stack([x - np.sin(heading) * aside, y + np.cos(heading) * aside], -1)
-    distance = np.hypot(*true.T)
-    range_std = 0.05 + np.where(vehicles, 0.05 * distance, 0.02 * distance + 0.0003 * distance**2)
-    cues = cues._replace(
-        covariance=line_of_sight(true, range_std, 0.02 + 0.002 * distance), flow_std=0.02 + 0.0012 * distance
-    )
+    cues = cues._replace(covariance=camera(true, vehicles), flow_std=0.02 + 0.0012 * np.hypot(*true.T))
     with quiet_doubles(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(noise.generate_state(1)[0]))
         measured = scatter(points, torch.from_numpy(aside), MODEL.prepare(cues), MODEL).numpy()
     cues = cues._replace(position=measured[:, :2], flow=np.where(vehicles, measured[:, 2], np.nan))
     return Seen(cues, dict(zip(evidence.names, offset.tolist(), strict=True)))
+
+
+def camera(true: Floats, vehicles: NDArray[np.bool_]) -> Floats:
+    """Covariances (N, 2, 2) of measured positions [m^2], at true positions (N, 2)."""
+    distance = np.hypot(*true.T)
+    range_std = 0.05 + np.where(vehicles, 0.05 * distance, 0.02 * distance + 0.0003 * distance**2)
+    return line_of_sight(true, range_std, 0.02 + 0.002 * distance)
 
 
 def turn_vehicles(cues: Cues, angle: Floats) -> Cues:

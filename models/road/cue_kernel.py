@@ -60,7 +60,7 @@ def nearest_sample(cues, n, table, step):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
-    """(log density, weight) of cue n about sample k; its residuals (3,) and their rows (3, 5) into rows (3, 6)."""
+    """(log density, weight) of cue n about sample k; its residuals (3,) and their rows (3, 5) into rows (3, 6), if any."""
     c, s, bend = table[k, COS], table[k, SIN], table[k, BEND]
     dx, dy = cues[n, PX] - table[k, X], cues[n, PY] - table[k, Y]
     along, across = dx * c + dy * s, dy * c - dx * s
@@ -79,6 +79,8 @@ def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
         log_density = math.log(road + cues[n, CLUTTER])
     else:
         log_density = log_road + math.log(root)
+    if len(rows) == 0:
+        return log_density, weight
     swing = -2.0 * ROOT_HALF * norm * (my * sx - mx * sy) / variance  # d variance / d heading, over sqrt(2) variance
     rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3] = e, -q * root, root, 0.0
     rows[0, 4], rows[0, 5] = -0.5 * along * along * root, -root
@@ -98,11 +100,14 @@ def paper_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
     along, lateral = (dx * c + dy * s) * root, (dy * c - dx * s - offset) * root
     turn = cues[n, FLOW] - table[k, HEADING] - cues[n, TURN]
     anti = (1.0 - math.cos(turn)) * cues[n, PRECISION]
+    log_density = cues[n, CONSTANT] + math.log(root) - 0.5 * (along * along + lateral * lateral + anti * anti)
+    if len(rows) == 0:
+        return log_density, 1.0
     rows[:] = 0.0
     rows[0, 0], rows[0, 1] = along, root
     rows[1, 0], rows[1, 2], rows[1, 5] = lateral, root, -root
     rows[2, 0], rows[2, 3] = anti, -math.sin(turn) * cues[n, PRECISION]
-    return cues[n, CONSTANT] + math.log(root) - 0.5 * (along * along + lateral * lateral + anti * anti), 1.0
+    return log_density, 1.0
 
 
 @nb.njit(error_model="numpy")

@@ -36,7 +36,7 @@ def group_densities(x, mean, tril, num, paper, cues, group, loc, std, out):  # t
     paper  whether as printed
     cues   (N, WIDTH) as in models.road.cue_kernel, group (N,) of each
     loc, std  (G,) of the offsets"""
-    course, clothoid, table, rows = np.empty(6), np.empty(6), np.empty((num, COLUMNS)), np.empty((3, 6))
+    course, clothoid, table, rows = np.empty(6), np.empty(6), np.empty((num, COLUMNS)), np.empty((0, 6))
     for i in range(len(x)):
         step = lay_course(x[i], mean, tril, course, clothoid, table)
         for g in range(len(loc)):

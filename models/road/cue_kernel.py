@@ -60,7 +60,7 @@ def nearest_sample(cues, n, table, step):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
-    """(log density, weight) of cue n about sample k; its residuals (3,) and their rows (3, 5) into rows (3, 6), if any."""
+    """(log density, weight) of cue n about sample k; residuals (3,) and their rows (3, 5) into rows (3, 6), if any."""
     c, s, bend = table[k, COS], table[k, SIN], table[k, BEND]
     dx, dy = cues[n, PX] - table[k, X], cues[n, PY] - table[k, Y]
     along, across = dx * c + dy * s, dy * c - dx * s

@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 Refined = tuple[Posterior, AnyEvidence, Routes]
 BAND = 0.9  # posterior probability between the edges of a band
 NUM_DRAWS = 1000  # of lines, over all readings
+LOST = 1.2  # times the cost of the best reading: courses of another one that cost more got lost
 
 
 def estimate(
@@ -80,7 +81,8 @@ def with_lanes(
         seen.append(
             (reading, refine_routes(model, evidence, reading.state, reading.routes, *arguments) if some else None)
         )
-    sound = [seen[0], *filter(_is_sound, seen[1:])]
+    worst = LOST * _cost(evidence, seen[0][1])
+    sound = [(reading, one) for reading, one in seen if _converged(one) or _cost(evidence, one) <= worst]
     total = sum(reading.share for reading, _ in sound)
     lanes_of = [_lanes_of(reading.share / total, reading, refined, seed) for reading, refined in sound]
     best, mixture = lanes_of[0], mix(lanes_of, BAND)
@@ -88,7 +90,7 @@ def with_lanes(
     if len(sound) < len(seen):
         flags.append(
             f"the courses of {len(seen) - len(sound)} of {len(seen)} readings of the tracks, {1 - total:.0%} of their "
-            "draws, did not converge: bands and probabilities leave them out"
+            "draws, got lost: bands and probabilities leave them out"
         )
     families = {key: value for key, value in posterior.info.items() if key.startswith("family")}
     info = (
@@ -119,9 +121,20 @@ def with_lanes(
     )
 
 
-def _is_sound(seen: tuple[Reading, Refined | None]) -> bool:
-    """Whether the courses of a reading converged: a Laplace posterior is one at a minimum only."""
-    return seen[1] is None or bool(seen[1][0].info.get("converged", True))
+def _converged(refined: Refined | None) -> bool:
+    return refined is None or bool(refined[0].info.get("converged", True))
+
+
+def _cost(evidence: JunctionEvidence, refined: Refined | None) -> float:
+    """Cost of courses for each point on their routes [nats], 0 where the engine knows none.
+
+    Courses that stall near their minimum, as real ones do where points change their nodes, cost a little more than
+    others; those that got lost cost far more, and their Laplace posterior means nothing."""
+    if refined is None:
+        return 0.0
+    assert evidence.tracks is not None
+    points = np.diff(evidence.tracks.offsets)[refined[2].track_route >= 0].sum()
+    return float(refined[0].info.get("cost", 0.0) / points)
 
 
 def _lanes_of(share: float, reading: Reading, refined: Refined | None, seed: int) -> ReadLanes:

@@ -19,7 +19,7 @@ from experiments.scenarios.scene import join_tracks
 from inference import least_squares
 from models.intersection.course_evidence import CourseEvidence
 from models.intersection.course_kernel import centre_line
-from models.intersection.course_lines import centre_lines, lane_bands, lane_nodes
+from models.intersection.course_lines import centre_lines, lane_bands, lane_nodes, layout_of
 from models.intersection.course_nodes import (
     ADVANCE,
     ANGLE,
@@ -467,8 +467,8 @@ def test_sites_can_be_fixed_and_the_program_checked() -> None:
 
 def test_other_points_are_refused() -> None:
     scene = SCENES["positions"]
-    latents = tensors(scene.latents)
-    seen = PointsOnCourses(MANY, scene.evidence, latents)
+    layout = layout_of(scene.evidence, scene.latents)
+    seen = PointsOnCourses(MANY, scene.evidence, layout, torch.from_numpy(layout.pack(scene.latents)))
     with pytest.raises(InputError, match=r"prepare\(\) others"):
         seen.log_prob(scene.evidence.points.clone())
 

@@ -17,6 +17,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from experiments.scenarios import interiors, paths
+from experiments.scenarios.border_marks import border_marks
 from experiments.scenarios.occlusion import occlude
 from experiments.scenarios.scene import Floats, Ints, JunctionTruth, Scene, join_tracks
 from models.intersection.borders import interior_radius
@@ -38,6 +39,7 @@ def protocol(
     tracks: int | None = None,
     max_lanes: int = 4,
     interior: Literal["bezier", "clothoid", "bumps"] = "bezier",
+    borders: float | None = None,
 ) -> Scene:
     """A simulated junction of the protocol.
 
@@ -48,8 +50,11 @@ def protocol(
     tracks        vehicles on each lane, None draws 3 to 5
     max_lanes     entries and exits of an arm are uniform on 1 to max_lanes
     interior      family of the courses between the arms, see `interiors`
+    borders       noise of points on the borders of lanes [m], see `border_marks`; None sees no borders. No occlusion
+                  hides them
 
-    Raises InputError for a negative seed, for max_lanes or tracks below one and for an unknown interior.
+    Raises InputError for a negative seed, for max_lanes or tracks below one, for an unknown interior and for borders
+    that are not a positive number.
     """
     if seed < 0:
         raise InputError(f"scenario protocol: seed is {seed}; choose 0 or more (0 to 999 are the frozen scenes)")
@@ -58,11 +63,15 @@ def protocol(
     if interior not in get_args(interiors.Kind):
         known = ", ".join(get_args(interiors.Kind))
         raise InputError(f"scenario protocol: interior is '{interior}'; choose one of {known}")
-    geometry, vehicles, view = np.random.SeedSequence(seed).spawn(3)
+    if borders is not None and not 0.0 < borders < math.inf:
+        raise InputError(f"scenario protocol: borders is {borders}; give a positive standard deviation, or null")
+    geometry, vehicles, view, marks = np.random.SeedSequence(seed).spawn(4)
     truth = random_junction(np.random.default_rng(geometry), max_lanes, interior)
     data, track_lane = drive(truth.lines, vehicles, position_std, heading_std, tracks)
     if occlusion:
         data, track_lane = occlude(data, track_lane, truth, np.random.default_rng(view))
+    if borders is not None:
+        data = data._replace(borders=border_marks(truth, ARM_LENGTH, borders, np.random.default_rng(marks)))
     truth = truth._replace(track_lane=track_lane)
     info = {
         "scenario": "protocol",
@@ -71,6 +80,7 @@ def protocol(
         "heading_std": heading_std,
         "occlusion": occlusion,
         "interior": interior,
+        "borders": borders,
         **counts(truth, data),
     }
     return Scene(data, truth, f"protocol {seed}", info)

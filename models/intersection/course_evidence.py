@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.intersection.border_points import BorderPoints, place_borders
 from models.intersection.borders import BEYOND, FARTHEST, interior_radius
 from models.intersection.course_nodes import ARM_WAVE, INNER_WAVE
 from models.intersection.routes import RoutedTracks, distinct
@@ -33,6 +34,7 @@ class CourseEvidence(NamedTuple):
     origin       (2,) [m]
     heading      whether headings were measured
     first        {site: value} where the structure itself is another than loc
+    borders      points on the borders of lanes, where any were seen
     """
 
     points: Tensor
@@ -47,6 +49,7 @@ class CourseEvidence(NamedTuple):
     origin: Array
     heading: bool
     first: dict[str, Array]
+    borders: BorderPoints | None = None
 
 
 def course_evidence(routed: RoutedTracks, spacing: float) -> CourseEvidence:
@@ -75,8 +78,10 @@ def course_evidence(routed: RoutedTracks, spacing: float) -> CourseEvidence:
     first = {"width": np.asarray(structure["width"], dtype=np.float64)[arms] - loc["lane_width"]}
     if "bend" in structure:
         first["bend"] = np.asarray(structure["bend"], dtype=np.float64)[arms]
-    measured = tracks.heading is not None
-    return CourseEvidence(torch.from_numpy(points), *table, loc, reach, counts, origin, measured, first)
+    measured, borders = tracks.heading is not None, None
+    if tracks.borders is not None:
+        borders = place_borders(tracks.borders, structure, loc["onset"])
+    return CourseEvidence(torch.from_numpy(points), *table, loc, reach, counts, origin, measured, first, borders)
 
 
 def prior_middles(structure: Mapping[str, Any], connections: Ints, num_stubs: int) -> dict[str, Array]:

@@ -143,7 +143,8 @@ def normal_equations(  # type: ignore[no-untyped-def]
         square_lane(nodes, counts[lane], noise, sums, latent, columns, block)
         for p in range(size):
             gradient[slots[lane, p]] += block[size, p]
-        hessian[lane] = block[:size]
+            for q in range(p + 1):  # an assignment of slices takes seconds to compile
+                hessian[lane, p, q] = block[p, q]
     return cost
 
 

@@ -60,18 +60,24 @@ def columns(sites: tuple[str, ...]) -> NDArray[np.int64]:
 class Layout:
     """Sites in one vector of numbers, constants included, and the part of it that each lane depends on.
 
-    where  (L, D') of the numbers of `course_nodes`"""
+    where  (L, D') of the numbers of `course_nodes`
+    sides  (2 K, D') the same for what all lanes of one side of an arm share, entries and exits arm by arm; -1 for the
+           rest"""
 
     def __init__(self, evidence: CourseEvidence, sites: tuple[str, ...]) -> None:
         ends = np.cumsum([0, *(evidence.loc[name].size for name in sites)])
         self.size = int(ends[-1])
         self.sites = {name: slice(int(ends[i]), int(ends[i + 1])) for i, name in enumerate(sites)}
-        num = len(evidence.connections)
+        num, arms = len(evidence.connections), len(evidence.loc["angle"])
         owners = np.column_stack(
             [np.zeros(num, np.int64), evidence.connections[:, ::2], evidence.stubs, np.arange(num)]
         )
         site, owner, width, place = columns(sites).T
-        self.where = ends[site] + width * owners[:, owner] + place
+        self.where = np.ascontiguousarray(ends[site] + width * owners[:, owner] + place)
+        arm, end = np.divmod(np.arange(2 * arms)[:, None], 2)
+        self.sides = np.where(
+            (owner == SELF) | (owner == ARM + end), ends[site] + width * np.where(owner == SELF, 0, arm) + place, -1
+        )
 
     def pack(self, latents: Mapping[str, Any]) -> Array:
         """{site: (*event)} to (D,)."""

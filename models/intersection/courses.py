@@ -12,6 +12,8 @@ estimated together from all points, with normal priors about what the structure 
     arm_wave (K, .), lane_wave (S, .), inner_wave (L, .)   control points across an arm, a lane of an arm and an
              interior [m]: what real lanes do besides
 
+Points on the borders of lanes, where any were seen, are a cue of their own (models.intersection.course_borders).
+
 See models.intersection.course_nodes for the curve and models.intersection.course_kernel for the residuals. [M20]
 fits one B-spline to every lane and ties neighbours on an arm together by their distance; here they share their arm.
 """
@@ -33,6 +35,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from models.capability import Squares
+from models.intersection.course_borders import PointsOnBorders, border_arrays, border_equations, log_border_constant
 from models.intersection.course_evidence import CourseEvidence, course_evidence
 from models.intersection.course_kernel import normal_equations
 from models.intersection.course_lines import SITES, Layout, needed
@@ -63,10 +66,11 @@ class LaneCourses:
     inner_wave_std: float = 0.15  # [m]
     position_std: float = 1.0  # of a point, on each axis [m]
     heading_std: float = 0.1  # of a measured heading [rad]
+    border_std: float = 0.2  # of a point on a border of a lane, on each axis [m]
     spacing: float = 1.0  # of the nodes [m]
 
     def __post_init__(self) -> None:
-        for name in (*(f"{site}_std" for site in SITES), "position_std", "heading_std", "spacing"):
+        for name in (*(f"{site}_std" for site in SITES), "position_std", "heading_std", "border_std", "spacing"):
             value, may_be_zero = getattr(self, name), name.removesuffix("_std") in SITES
             if not math.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
                 least = "zero or positive" if may_be_zero else "positive"
@@ -77,7 +81,12 @@ class LaneCourses:
         for name in SITES:
             loc, std = torch.from_numpy(evidence.loc[name]), getattr(self, f"{name}_std")
             latents[name] = pyro.sample(name, dist.Normal(loc, std).to_event(loc.dim())) if std > 0 else loc
-        pyro.sample("points", PointsOnCourses(self, evidence, latents), obs=evidence.points)
+        layout = Layout(evidence, self.sites)
+        numbers = in_one_row(evidence, layout, latents)
+        pyro.sample("points", PointsOnCourses(self, evidence, layout, numbers), obs=evidence.points)
+        if evidence.borders is not None:
+            on_borders = PointsOnBorders(evidence.borders, self.border_std, numbers, layout.sides)
+            pyro.sample("borders", on_borders, obs=evidence.borders.points)
 
     @property
     def sites(self) -> tuple[str, ...]:
@@ -101,18 +110,24 @@ class LaneCourses:
                 shapes[name] = evidence.loc[name].shape
                 sites[name] = slice(end, end + evidence.loc[name].size)
                 end = sites[name].stop
-        scale = [np.full(part.stop - part.start, getattr(self, f"{name}_std")) for name, part in sites.items()]
-        loc = np.concatenate([evidence.loc[name].reshape(-1) for name in sites])
+        stds = [np.full(part.stop - part.start, getattr(self, f"{name}_std")) for name, part in sites.items()]
+        loc, scale = np.concatenate([evidence.loc[name].reshape(-1) for name in sites]), np.concatenate(stds)
         whole = Layout(evidence, self.sites)
         index = np.concatenate([np.arange(whole.sites[name].start, whole.sites[name].stop) for name in sites])
         base = whole.pack(evidence.loc)
-        slots = np.full(whole.size, -1)
+        slots = np.full(whole.size + 1, -1)  # the last one for rows without a number
         slots[index] = np.arange(len(index))
         latent = np.flatnonzero(slots[whole.where[0]] >= 0)  # the same numbers of all lanes
         blocks = np.ascontiguousarray(slots[whole.where[:, latent]])
-        data = (whole.where, latent, blocks, *evidence_arrays(self, evidence))
-        evaluate = partial(_evaluate, base, index, data)
-        return Squares(loc, np.concatenate(scale), sites, shapes, evaluate, log_constant(self, evidence), blocks=blocks)
+        data, marks = (whole.where, latent, blocks, *evidence_arrays(self, evidence)), None
+        log_const = log_constant(self, evidence)
+        if evidence.borders is not None:
+            beside = np.ascontiguousarray(slots[whole.sides[:, latent]])
+            marks = (whole.sides, latent, beside, *border_arrays(evidence.borders, self.border_std))
+            log_const += log_border_constant(evidence.borders, self.border_std)
+            blocks = np.concatenate([blocks, beside])
+        evaluate = partial(_evaluate, base, index, data, marks)
+        return Squares(loc, scale, sites, shapes, evaluate, log_const, blocks=blocks)
 
 
 def evidence_arrays(model: LaneCourses, evidence: CourseEvidence) -> tuple[Any, ...]:
@@ -133,30 +148,47 @@ def log_constant(model: LaneCourses, evidence: CourseEvidence) -> float:
     return num * each
 
 
-def _evaluate(base: Array, index: Ints, data: tuple[Any, ...], z: Array, hessian: Array, gradient: Array) -> float:
-    """`normal_equations` in the numbers that are latent."""
-    full = base.copy()
+def _evaluate(
+    base: Array,
+    index: Ints,
+    data: tuple[Any, ...],
+    marks: tuple[Any, ...] | None,
+    z: Array,
+    hessian: Array,
+    gradient: Array,
+) -> float:
+    """`normal_equations` in the numbers that are latent; `border_equations` in the blocks behind those of the lanes."""
+    full, lanes = base.copy(), len(data[0])
     full[index] = z
-    return float(normal_equations(full, *data, hessian, gradient))  # type: ignore[call-arg]
+    cost = normal_equations(full, *data, hessian[:lanes], gradient)  # type: ignore[call-arg]
+    if marks is not None:
+        cost += border_equations(full, *marks, hessian[lanes:], gradient)  # type: ignore[call-arg]
+    return float(cost)
+
+
+def in_one_row(evidence: CourseEvidence, layout: Layout, latents: dict[str, Tensor]) -> Tensor:
+    """{site: (*batch or nothing, *event)} as the numbers (*batch, D') of a layout."""
+    events = {name: evidence.loc[name].ndim for name in layout.sites}
+    values = {name: latents[name] for name in events}
+    batch = torch.broadcast_shapes(*(v.shape[: v.dim() - events[n]] for n, v in values.items()))
+    flat = [v.expand(batch + v.shape[v.dim() - events[n] :]).reshape((*batch, -1)) for n, v in values.items()]
+    return torch.cat(flat, -1)
 
 
 class PointsOnCourses(TorchDistribution):
     """Points (3, N) about the courses of their lanes.
 
     Across its lane a point is normal; along it, it may be anywhere: a density of the lateral positions and headings
-    given where along the lanes they are. It cannot simulate."""
+    given where along the lanes they are. It cannot simulate.
+
+    numbers  (*batch, D') of the layout"""
 
     arg_constraints: dict[str, Any] = {}  # noqa: RUF012
     support = constraints.independent(constraints.real, 2)
 
-    def __init__(self, model: LaneCourses, evidence: CourseEvidence, latents: dict[str, Tensor]) -> None:
-        self.model, self.evidence, self.layout = model, evidence, Layout(evidence, model.sites)
-        events = {name: evidence.loc[name].ndim for name in self.layout.sites}
-        latents = {name: latents[name] for name in events}
-        batch = torch.broadcast_shapes(*(v.shape[: v.dim() - events[n]] for n, v in latents.items()))
-        flat = [v.expand(batch + v.shape[v.dim() - events[n] :]).reshape((*batch, -1)) for n, v in latents.items()]
-        self.numbers = torch.cat(flat, -1)
-        super().__init__(batch, torch.Size([3, evidence.points.shape[-1]]), validate_args=False)
+    def __init__(self, model: LaneCourses, evidence: CourseEvidence, layout: Layout, numbers: Tensor) -> None:
+        self.model, self.evidence, self.layout, self.numbers = model, evidence, layout, numbers
+        super().__init__(numbers.shape[:-1], torch.Size([3, evidence.points.shape[-1]]), validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
         if value is not self.evidence.points:

@@ -135,7 +135,7 @@ def junction_evidence(tracks: Tracks, model: Junction) -> JunctionEvidence:
     track = np.searchsorted(offsets, begin, side="right") - 1
     num = len(offsets) - 1
     halves = (torch.from_numpy(observed), s, starts, track, num, int(entries))
-    return JunctionEvidence(*halves, origin, measured, Tracks(points, heading, offsets), whole)
+    return JunctionEvidence(*halves, origin, measured, Tracks(points, heading, offsets, tracks.borders), whole)
 
 
 def scaled(evidence: JunctionEvidence, observed: Array, model: Junction) -> Array:

@@ -14,8 +14,10 @@ class Tracks(NamedTuple):
     points   (N, 2) [m]
     heading  (N,) driving direction [rad], None where it was not measured
     offsets  (T + 1,) track t holds points[offsets[t]:offsets[t + 1]]
+    borders  (M, 2) points on the borders of lanes, markings or curbs, that were seen beside the tracks [m]
     """
 
     points: NDArray[np.float64]
     heading: NDArray[np.float64] | None
     offsets: NDArray[np.int64]
+    borders: NDArray[np.float64] | None = None

@@ -44,7 +44,7 @@ def run(
     transform: Literal["prior", "laplace"] = "prior",
     moves: Literal["auto", "walk", "model"] = "auto",
     num_particles: int = 1000,
-    num_moves: int = 10,
+    num_moves: int | None = None,
     ess: float = 0.5,
     progress: bool = False,
 ) -> Posterior:
@@ -54,19 +54,21 @@ def run(
     transform      of the numbers that walk: the path leads from the "prior", or from a "laplace" fit, which is shorter
                    but may miss what the fit does not reach
     moves          "walk" in whitened numbers, or the "model"'s own; "auto" takes its own where its dimension is unknown
-    num_moves      steps of every particle in a stage; reversible jump needs many more than walks
+    num_moves      steps of every particle in a stage; None makes 10 walks, or 200 steps of reversible jump
     ess            share of the particles that the weights of a stage are worth
 
     Raises InputError by name for latents that cannot be whitened, for a model without moves where its own are asked
     for, and for an init that no Laplace fit begins at."""
     began = time.perf_counter()
+    jumps = _jumps(model, moves)
+    num_moves = (200 if jumps else 10) if num_moves is None else num_moves
     _check(num_particles, num_moves, ess)
     if init is not None and transform == "prior":
         raise InputError("smc begins at the prior, not at init; leave init out or use transform=laplace")
     first, shared = np.random.SeedSequence(seed).spawn(2)
     rng = np.random.default_rng(shared)
     population: Population
-    if _jumps(model, moves):
+    if jumps:
         if transform != "prior":
             raise InputError(f"transform={transform} is for numbers that walk; use transform=prior or moves=walk")
         with announce(f"compiling the sampler for {type(model).__name__}"):

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.figure import Figure, Measurement, Value, Values, share
 from benchmarks.road_trials import Effort, best_checks, drive, frozen, paired_loss, reference, shares
-from experiments.road_metrics import CUT, LEAST_RANGE, TOLD, RoadCheck
+from experiments.road_metrics import CUT, LEAST_RANGE, PRICE, TOLD, RoadCheck
 
 SCENES = "frozen scenes of night_road, engine=importance"
 
@@ -32,8 +32,9 @@ CALIBRATED = Measurement(
         Figure(
             "tpr_mid",
             "share",
-            f"{SCENES}: course wholly inside the mid tube (.6 + .010 r) from 5 m to its calibrated range, which ends "
-            f"where the posterior probability of having stayed inside falls below {CUT}; of all scenes",
+            f"{SCENES}: course wholly inside the mid tube (.6 + .010 r) from 5 m to its calibrated range, the "
+            f"r worth most, r - {PRICE:.0f} m (1 - P), where the posterior probability P of staying inside is {CUT} or "
+            "more; of all scenes",
             ".922",
             at_least=0.95,
         ),

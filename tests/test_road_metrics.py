@@ -87,11 +87,21 @@ def test_bands_cover_as_often_as_the_draws_say() -> None:
 def test_the_calibrated_range_ends_where_a_tenth_of_the_draws_has_left_the_tube() -> None:
     width, apart = half_width("mid"), np.zeros((20, len(RANGES)))
     apart[:2, 9] = 1.01 * width[9]
-    assert trusted_range(apart, 0.9) == RANGES[-1]  # two of twenty may leave
+    assert trusted_range(apart, 0.9, 0.0) == RANGES[-1]  # two of twenty may leave
     apart[2, 11] = -1.01 * width[11]
-    assert trusted_range(apart, 0.9) == RANGES[10]  # that the first two came back does not count
+    assert trusted_range(apart, 0.9, 0.0) == RANGES[10]  # that the first two came back does not count
     apart[:, 0] = 1.01 * width[0]
-    assert trusted_range(apart, 0.9) == 0.0
+    assert trusted_range(apart, 0.9, 0.0) == 0.0
+
+
+def test_risk_is_taken_for_metres_that_are_worth_it() -> None:
+    width, apart = half_width("mid"), np.zeros((20, len(RANGES)))
+    apart[0, 7] = 1.01 * width[7]  # one of twenty leaves at 40 m: 105 m more for 5 % of the price
+    apart[1, 27] = 1.01 * width[27]  # another at 140 m: 5 m more for as much
+    assert trusted_range(apart, 0.8, 99.0) == 140.0
+    assert trusted_range(apart, 0.8, 101.0) == 135.0
+    assert trusted_range(apart, 0.8, 1999.0) == 135.0
+    assert trusted_range(apart, 0.8, 2001.0) == 35.0
 
 
 @pytest.mark.parametrize(

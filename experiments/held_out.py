@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
-from experiments.lanes import BAND, Lanes
+from experiments.lanes import Lanes
 from experiments.scenarios import paths
 from experiments.scenarios.scene import Scene, join_tracks
-from experiments.traffic_lanes import Learn, TrafficPosterior
+from experiments.traffic_lanes import EDGE, Learn, TrafficPosterior
 from inference.posterior import Posterior
 from models.intersection.laid_tracks import ways
 from models.intersection.tracks import Tracks
@@ -41,8 +41,6 @@ Ints = NDArray[np.int64]
 FOLDS = 5
 TRUST = 50.0  # points that the spread about all lanes counts for in that about one
 STRAY = 0.02  # share of points, and of tracks, that are on no lane
-QUANTILE = 1.6448536269514722  # standard deviations of a normal distribution from its middle to the edge of BAND
-assert BAND == 0.9
 
 
 class Predictive(NamedTuple):
@@ -63,8 +61,8 @@ class Predictive(NamedTuple):
 def metrics(posterior: Posterior, scene: Scene, folds: int = FOLDS) -> dict[str, float]:
     """Held-out scores of the engine that made a posterior; nothing where it cannot be run again.
 
-    traffic_nll          minus the log density of unseen vehicles under lanes estimated together [nats per point]
-    traffic_nll_splines  the same where each lane is a spline by itself; tracks are on the same lanes
+    traffic_nll          minus the log density of unseen vehicles under the engine's lanes [nats per point]
+    traffic_nll_splines  the same of independent splines (experiments.traffic_splines); tracks are on the same lanes
 
     Raises InputError for fewer than two folds or fewer vehicles than folds."""
     if not isinstance(posterior, TrafficPosterior) or posterior.again is None:
@@ -109,7 +107,7 @@ def predictive(lanes: Lanes, train: Tracks, area: float) -> Predictive:
         square[route[track]] += (across[np.isfinite(across)] ** 2).sum()
     spread = (TRUST * square.sum() / num.sum() + square) / (TRUST + num)
     sides = zip(lanes.left, lanes.right, strict=True)
-    course = [((left + right) / (2 * QUANTILE)) ** 2 for left, right in sides]
+    course = [((left + right) / (2 * EDGE)) ** 2 for left, right in sides]
     size = np.bincount(route[route >= 0], minlength=len(lanes.lines))
     return Predictive(lanes.lines, [s + v for s, v in zip(spread, course, strict=True)], size / size.sum(), area)
 

@@ -5,7 +5,9 @@
     waybayes experiment=lankershim_lanes scenario=csv scenario.path=tracks.csv
 
 The sibling of experiments.lanes without a structure: models.intersection.traffic_lanes.TrafficLanes finds the lanes,
-and the refining engine estimates their courses together.
+and the refining engine estimates their courses, once with what lanes of an arm share and once each by itself: the
+larger evidence decides. Drivers who are about to turn keep off the middle of their lane, so that recorded lanes share
+less than drawn ones.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.lanes import BAND, Engine, LanePosterior, Lanes
+from experiments.traffic_splines import spline_lanes
 from inference.posterior import Posterior
 from models.intersection.free_lines import centre_lines, lane_bands
 from models.intersection.routes import RoutedTracks
@@ -28,13 +31,15 @@ from models.program import InputError
 Array = NDArray[np.float64]
 Learn = Callable[[Tracks], tuple[Lanes, Lanes]]
 NUM_DRAWS = 500  # for bands
+EDGE = 1.6448536269514722  # standard deviations of a normal distribution from its middle to the edge of BAND
+assert BAND == 0.9
 
 
 @dataclass(frozen=True)
 class TrafficPosterior(LanePosterior):
     """The posterior of the courses of all lanes.
 
-    again  estimates lanes from other tracks in the same way, and with every lane by itself, for held-out scores"""
+    again  estimates lanes from other tracks in the same way, and as independent splines, for held-out scores"""
 
     again: Learn | None = None
 
@@ -45,7 +50,7 @@ def estimate(model: TrafficLanes, evidence: TrafficEvidence, *, seed: int, refin
         raise InputError(
             f"engine lanes_traffic needs model=traffic_lanes, which finds lanes in tracks, not {type(model).__name__}"
         )
-    found = refine(model, evidence, seed=seed)
+    found, evidence = choose(model, evidence, refine, seed)
     lanes = lanes_of(evidence, found, seed)
     used = evidence.routes.track_route >= 0
     info = found.info | {
@@ -64,15 +69,29 @@ def estimate(model: TrafficLanes, evidence: TrafficEvidence, *, seed: int, refin
     )
 
 
-def learn(model: TrafficLanes, refine: Engine, seed: int, tracks: Tracks) -> tuple[Lanes, Lanes]:
-    """Lanes of other tracks: together, and on the same routes each by itself."""
-    evidence = model.prepare(tracks)
+def choose(
+    model: TrafficLanes, evidence: TrafficEvidence, refine: Engine, seed: int
+) -> tuple[Posterior, TrafficEvidence]:
+    """Courses of lanes that share and of lanes by themselves, whichever has the larger evidence; info says which,
+    `shared`, and by how many nats, `shared_nats`.
+
+    Raises InputError where the engine tells no evidence."""
     alone = replace(model, courses=replace(model.courses, shared=False))
-    by_itself = evidence._replace(courses=alone.courses.prepare(RoutedTracks(tracks, {}, evidence.routes)))
-    return (
-        lanes_of(evidence, refine(model, evidence, seed=seed), seed),
-        lanes_of(by_itself, refine(alone, by_itself, seed=seed), seed),
-    )
+    apart = evidence._replace(courses=alone.courses.prepare(RoutedTracks(evidence.tracks, {}, evidence.routes)))
+    both = [refine(model, evidence, seed=seed), refine(alone, apart, seed=seed)]
+    if both[0].log_evidence is None or both[1].log_evidence is None:
+        raise InputError("refine tells no evidence to choose by; set refine=least_squares")
+    nats = both[0].log_evidence - both[1].log_evidence
+    best = int(nats < 0)
+    info = both[best].info | {"shared": best == 0, "shared_nats": nats}
+    return replace(both[best], info=info), (evidence, apart)[best]
+
+
+def learn(model: TrafficLanes, refine: Engine, seed: int, tracks: Tracks) -> tuple[Lanes, Lanes]:
+    """Lanes of other tracks, and on the same routes as independent splines."""
+    found, evidence = choose(model, model.prepare(tracks), refine, seed)
+    splines = spline_lanes(evidence.courses, evidence.routes, model.courses.position_std, EDGE)
+    return lanes_of(evidence, found, seed), splines
 
 
 def lanes_of(evidence: TrafficEvidence, posterior: Posterior, seed: int) -> Lanes:

@@ -82,5 +82,5 @@ def test_real_courses_begin_behind_the_car_and_are_the_same_again() -> None:
 
 @pytest.mark.skipif(not ROADS.exists(), reason=f"no {ROADS}")
 def test_an_unknown_sequence_is_named_with_those_there_are() -> None:
-    with pytest.raises(InputError, match="no sequence is named '99'.*'?10"):
+    with pytest.raises(InputError, match=r"no sequence is named '99'.*'?10"):
         kitti_course("99")

@@ -42,6 +42,11 @@ class State(NamedTuple):
     gradient: Array
     hessian: Array
 
+    @property
+    def misfit(self) -> float:
+        """Cost of the observations alone."""
+        return self.cost - 0.5 * float(self.x @ self.x)
+
 
 class Path(NamedTuple):
     """What a minimisation did: the last state, prior scales (D,), latents by step, whether nothing is left to gain, and
@@ -49,7 +54,7 @@ class Path(NamedTuple):
 
     state: State
     scale: Array
-    visited: list[tuple[float, float, Array]]  # seconds, cost, z (D,)
+    visited: list[tuple[float, float, Array]]  # seconds, cost of the observations, z (D,)
     converged: bool
     factor: Factor
 
@@ -80,7 +85,7 @@ def minimise(
     shape = arrow(squares.blocks, len(x))
     own, spare = (np.empty((*shape.slots.shape, shape.slots.shape[1])) for _ in range(2))
     state = linearise(squares, scale, x, own)
-    visited = [(time.perf_counter() - began, state.cost, squares.loc + scale * x)]
+    visited = [(time.perf_counter() - began, state.misfit, squares.loc + scale * x)]
     for number in range(num_steps):
         factor = factorise(shape, state.hessian, scale, damping)
         move = -solve(factor, state.gradient)
@@ -98,7 +103,7 @@ def minimise(
             damping, growth = damping * growth, 2.0 * growth
         if learn and number in LEARNT_AFTER:  # variances of the step's start: near enough
             state, scale = relearn(squares, state, scale, variances(factor), learn)
-        visited.append((time.perf_counter() - began, state.cost, squares.loc + scale * state.x))
+        visited.append((time.perf_counter() - began, state.misfit, squares.loc + scale * state.x))
     factor = factorise(shape, state.hessian, scale)
     converged = stopped and 0.5 * squared_norm(factor, state.gradient) <= max(tolerance, STALL)
     return Path(state, scale, visited, converged, factor)
@@ -152,7 +157,9 @@ def run(
     path = minimise(squares, x, num_steps=num_steps, damping=damping, tolerance=tolerance, learn=learn)
     noise = np.random.default_rng(np.random.SeedSequence(seed)).standard_normal((num_draws, len(x)))
     numbers = path.state.x + colour(path.factor, noise)
-    times, costs, states = zip(*path.visited, strict=True)
+    times, misfits, visited = zip(*path.visited, strict=True)
+    states = np.stack(visited)
+    priors = 0.5 * np.square((states - squares.loc) / path.scale).sum(1)  # of the last scales: one density for all
     scales = {name: float(path.scale[part][0]) for name, part in squares.sites.items() if name in learn}
     steps, volume = len(states) - 1, 0.5 * len(x) * np.log(2 * np.pi) + squares.log_volume
     flag = f"not converged after {num_steps} steps; raise num_steps or start closer (init)"
@@ -175,7 +182,7 @@ def run(
         snapshots=Snapshots(
             np.arange(len(states)),
             np.array(times),
-            squares.log_const - np.array(costs) - volume - np.log(path.scale).sum(),
-            squares.unpack(np.stack(states)),
+            squares.log_const - np.array(misfits) - priors - volume - np.log(path.scale).sum(),
+            squares.unpack(states),
         ),
     )

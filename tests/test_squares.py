@@ -232,6 +232,14 @@ def test_learning_is_reported_and_used() -> None:
     assert np.all(np.abs(flat(posterior).std(0) / sd - 1.0) < 4 / math.sqrt(2 * 20000))
 
 
+def test_snapshots_are_all_valued_under_the_scales_learnt_last() -> None:
+    posterior = least_squares.run(CompiledLine(), SEEN, seed=1, learn=["b"], num_draws=1)
+    found, learnt = posterior.snapshots, Line()
+    learnt.STD = posterior.info["learnt_scales"]["b"]  # type: ignore[misc]
+    states = {name: torch.from_numpy(value) for name, value in found.states.items()}
+    np.testing.assert_allclose(found.log_joint, log_joint(learnt, states, SEEN), rtol=1e-10)
+
+
 def test_relearning_moves_the_scale_alone() -> None:
     """Latents and what the data say stay, to rounding: cost, gradient and hessian in natural units."""
     x = RNG.standard_normal(7)

@@ -95,8 +95,16 @@ def extend(rounds: Rounds, target: Target, proposals: list[Proposal], num: int, 
 
 
 def learn(u: Array, log_weights: Array) -> Proposal:
-    """The next proposal: moments of the draws u (n, D) under their tempered weights."""
-    power = weights.temper(log_weights, max(LEAST, ENOUGH * u.shape[1]))
+    """The next proposal: moments of the draws u (n, D) under their tempered weights.
+
+    Raises InputError where D draws or fewer have any weight."""
+    some, size = int(np.count_nonzero(log_weights != -np.inf)), u.shape[1]
+    if some <= size:
+        raise InputError(
+            f"{some} of {len(u)} draws have any weight, too few to teach a proposal of {size} numbers; "
+            "raise num_draws, or begin nearer to the posterior (init)"
+        )
+    power = weights.temper(log_weights, max(LEAST, ENOUGH * size))
     share = weights.normalise(power * log_weights)
     centre = share @ u
     apart = u - centre

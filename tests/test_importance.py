@@ -103,6 +103,15 @@ def test_a_proposal_learns_the_moments_of_even_weights() -> None:
     assert proposal.tril @ proposal.tril.T == pytest.approx(np.cov(u.T, bias=True))
 
 
+@pytest.mark.parametrize("some", [0, 3])
+def test_too_few_draws_with_any_weight_are_refused(some: int) -> None:
+    u = np.random.default_rng(2).standard_normal((200, 3))
+    with pytest.raises(InputError, match=f"^{some} of 200 draws have any weight, too few to teach a proposal of 3 num"):
+        learn(u, np.where(np.arange(200) < some, 0.0, -np.inf))
+    with pytest.raises(FloatingPointError):
+        learn(u, np.full(200, np.nan))
+
+
 def test_both_modes_are_kept_with_their_weights() -> None:
     """z-scores from 25 runs as above; exact by quadrature."""
 

@@ -38,7 +38,8 @@ def factored(model: Model, evidence: Any) -> Factors:
     width = len(bound.log_likelihoods(torch.zeros(1, bound.size, dtype=torch.float64)))
 
     def columns(x: Tensor) -> Tensor:  # (S, K)
-        return torch.stack([f.expand(len(x)) for f in bound.log_likelihoods(x).values()], -1)
+        heights = [f.expand(len(x)) for f in bound.log_likelihoods(x).values()]
+        return torch.stack(heights, -1) if heights else x.new_zeros((len(x), 0))
 
     def evaluate(x: Array) -> Array:
         with torch.no_grad():
@@ -70,11 +71,13 @@ def factored(model: Model, evidence: Any) -> Factors:
 
 
 def _is_seen_through(bound: Bound) -> bool:
-    """Whether torch follows every observed density down to the numbers: one that moves must have a gradient."""
+    """Whether torch follows the observed densities down to the numbers: each that moves must have a gradient, and one
+    must, for torch refuses the gradient of what is constant."""
     first, second = (torch.full((1, bound.size), at, dtype=torch.float64) for at in (0.1, 0.3))
     try:
         here = bound.log_likelihoods(first.requires_grad_())
     except RuntimeError:  # a tensor with gradients has no numpy()
         return False
     there = bound.log_likelihoods(second)
-    return all(f.requires_grad or torch.equal(f, there[name]) for name, f in here.items())
+    seen = [f.requires_grad for f in here.values()]
+    return any(seen) and all(s or torch.equal(f, there[name]) for s, (name, f) in zip(seen, here.items(), strict=True))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
@@ -33,6 +35,37 @@ def test_gradient_is_that_of_the_factors_at_every_point() -> None:
             step = eps * np.eye(2)[d]
             apart = factors.evaluate(x + step).sum(-1) - factors.evaluate(x - step).sum(-1)
             assert slope[:, d] == pytest.approx(apart / (2 * eps), rel=1e-6)
+
+
+def test_a_program_that_observes_nothing_is_its_prior() -> None:
+    factors = factored(lambda _: pyro.sample("a", dist.Normal(torch.zeros(2), 3.0).to_event(1)), None)
+    assert factors.evaluate(X).shape == (5, 0)
+    height, slope = factors.gradient(X)
+    assert np.array_equal(height, np.zeros(5)) and np.array_equal(slope, np.zeros((5, 2)))
+    assert factors.latents(X)["a"] == pytest.approx(3.0 * X)
+
+
+class Threshold(dist.TorchDistribution):
+    """log p = -max(a - 0.4, 0)^2, by numpy: flat below, and closed to torch."""
+
+    support, arg_constraints, has_rsample = dist.constraints.real, {}, False
+
+    def __init__(self, a: torch.Tensor) -> None:
+        self.a = a
+        super().__init__(a.shape)
+
+    def log_prob(self, value: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(-np.square(np.maximum(self.a.detach().numpy() - 0.4, 0.0)))
+
+
+def test_a_density_closed_to_torch_has_its_gradient_past_where_it_is_flat() -> None:
+    def program(_: None) -> None:
+        a = pyro.sample("a", dist.Normal(0.0, 1.0))
+        pyro.sample("y", Threshold(a), obs=torch.tensor(0.0))
+
+    x = np.array([[1.5], [0.2]])
+    _, slope = factored(program, None).gradient(x)
+    assert slope == pytest.approx(np.array([[-2.2], [0.0]]), abs=1e-6)
 
 
 def test_latents_and_whiten_are_inverse() -> None:

@@ -63,7 +63,8 @@ def pareto_k(log_weights: Array) -> float:
         k(theta) = mean log(1 - theta y_m),   profile likelihood l(theta) = M (log(-theta / k) - k - 1)
         theta^ = the mean of a grid of theta under exp(l),   k^ = (M k(theta^) + 5) / (M + 10)
 
-    NaN where fewer than five weights stand out."""
+    Infinity where fewer than five weights are more than nothing beside the largest one; NaN where fewer than five stand
+    out from the others."""
     ordered = np.sort(log_weights.reshape(-1))
     ordered = np.exp(ordered - ordered[-1])
     num = int(np.ceil(min(0.2 * len(ordered), 3.0 * np.sqrt(len(ordered)))))
@@ -73,7 +74,7 @@ def pareto_k(log_weights: Array) -> float:
     tail = ordered[ordered > cut] - cut
     num = len(tail)
     if num < 5:
-        return float("nan")
+        return float("nan" if cut > 0.0 else "inf")
     grid = 30 + int(np.sqrt(num))
     quartile = tail[int(num / 4 + 0.5) - 1]
     theta = 1.0 / tail[-1] + (1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3.0 * quartile)

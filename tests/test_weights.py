@@ -74,6 +74,10 @@ def test_pareto_shape_of_pareto_weights_is_theirs() -> None:
         assert weights.pareto_k(-k * np.log(uniforms)) == pytest.approx(k, abs=3 * (1 + k) / np.sqrt(600))
 
 
+def test_a_weight_beside_which_the_others_vanish_has_the_heaviest_tail() -> None:
+    assert weights.pareto_k(-800.0 * np.arange(1000)) == np.inf
+
+
 def test_a_handful_of_weights_has_no_tail() -> None:
     assert np.isnan(weights.pareto_k(np.zeros(10)))
     assert np.isnan(weights.pareto_k(np.zeros(1000)))

@@ -130,16 +130,20 @@ def normal_equations(  # type: ignore[no-untyped-def]
         most = max(most, counts[lane, 0] + counts[lane, 1] + 1 + counts[lane, 2])
     width, size, cost = where.shape[1], len(latent), 0.0
     nodes, sums, columns = np.empty((most, 5 + width)), np.empty((3, most)), np.empty((size + 1, 2 * most))
+    near = np.empty((most, 5))  # the nodes without their derivatives, close together in memory for the points
     block, v = np.empty((size + 1, size)), np.empty(width)
     gradient[:] = 0.0
     for lane in range(len(where)):
         for p in range(width):
             v[p] = z[where[lane, p]]
         num = course_nodes(v, lanes[lane], reach[lane], counts[lane], nodes)
+        for j in range(num):
+            for p in range(5):
+                near[j, p] = nodes[j, p]
         sums[:] = 0.0
         for k in range(starts[lane], starts[lane + 1]):
             t = tracks[k]
-            cost += sum_points(points, offsets[t], offsets[t + 1], nodes, num, noise, sums)
+            cost += sum_points(points, offsets[t], offsets[t + 1], near, num, noise, sums)
         square_lane(nodes, counts[lane], noise, sums, latent, columns, block)
         for p in range(size):
             gradient[slots[lane, p]] += block[size, p]

@@ -12,7 +12,10 @@ Each cell is an ordinary stored run, so a comparison resumes and grows without r
 
     time_s         of the engine, the median over seeds: the first run of a process pays for compilation
 
-The reference is the model's exact posterior where it has one, else that of the first engine that ran.
+    ess_min        effective draws of the scalar that has the fewest
+
+The reference is the model's exact posterior where it has one, else that of the engine reference=NAME, else that of the
+first engine that ran.
 """
 
 from __future__ import annotations
@@ -42,6 +45,7 @@ class Plan(NamedTuple):
     shared  settings of every run
     own     {engine: its settings}
     named   whether the engines were asked for by name; one of the usual ones may refuse a model
+    reference  the engine that the others are measured by; None takes the first that ran
     """
 
     engines: list[str]
@@ -49,6 +53,7 @@ class Plan(NamedTuple):
     shared: list[str]
     own: dict[str, list[str]]
     named: bool
+    reference: str | None = None
 
 
 class Cell(NamedTuple):
@@ -76,6 +81,7 @@ class Row(NamedTuple):
 def plan(words: list[str]) -> Plan:
     """Read the command line. Raises ConfigError for words that say nothing."""
     engines, seeds, rest, named = ["rjmcmc", "least_squares"], 3, [], False
+    reference = None
     for word in words:
         override = OverridesParser.create().parse_override(word)
         if override.key_or_group == "engines":
@@ -88,13 +94,17 @@ def plan(words: list[str]) -> Plan:
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ConfigError(f"seeds is '{value}'; give how many seeds to run, 1 or more")
             seeds = value
+        elif override.key_or_group == "reference":
+            reference = str(override.value())
         elif override.key_or_group in ("engine", "seed"):
             raise ConfigError(f"a comparison takes engines=[...] and seeds=N, not {word}")
         else:
             rest.append(word)
+    if reference is not None and reference not in engines:
+        raise ConfigError(f"reference is '{reference}', which does not run; choose one of {', '.join(engines)}")
     heads = {word: word.lstrip("+~").partition(".")[0] for word in rest}
     own = {e: [_for_engine(word, e) for word in rest if heads[word] == e] for e in engines}
-    return Plan(engines, seeds, [word for word in rest if heads[word] not in engines], own, named)
+    return Plan(engines, seeds, [word for word in rest if heads[word] not in engines], own, named, reference)
 
 
 def _for_engine(word: str, engine: str) -> str:
@@ -199,20 +209,34 @@ def against(summary: Summary, reference: Summary, by_position: bool) -> dict[str
     }
 
 
-def tabulate(rows: list[Row], exact: Summary | None) -> list[dict[str, Any]]:
-    """One record for each engine: mean and sd over its seeds of every score, and its distance to the reference.
+def reference_of(rows: list[Row], best: str | None) -> str | None:
+    """The engine that the others are measured by: `best` where it ran, else the first that did."""
+    ran = [row.engine for row in rows if row.cells]
+    return best if best in ran else next(iter(ran), None)
+
+
+def fewest(summary: Summary) -> float | None:
+    """Effective draws of the scalar that has the fewest."""
+    sizes = [row["ess_bulk"] for row in summary.values() if row.get("ess_bulk") is not None]
+    return min(sizes, default=None)
+
+
+def tabulate(rows: list[Row], exact: Summary | None, best: str | None = None) -> list[dict[str, Any]]:
+    """One record for each engine: mean and sd over its seeds of every score, and its distance to the reference: the
+    exact posterior, else that of the engine `best`, else that of the first that ran.
 
     Scores that are 0 or 1 have their share alone, which says all."""
     import numpy as np
 
-    reference = exact or next((pooled(row.cells) for row in rows if row.cells), {})
-    first = next((row.engine for row in rows if row.cells), None)
+    first = reference_of(rows, best)
+    reference = exact or next((pooled(row.cells) for row in rows if row.engine == first), {})
     records = []
     for row in rows:
         record: dict[str, Any] = {"engine": row.engine, "seeds": len(row.cells), "error": row.error}
         if row.cells:
             columns = {name: [c.scores.get(name) for c in row.cells] for name in row.cells[0].scores}
             columns |= {"time_s": [c.seconds for c in row.cells], "evaluations": [c.evaluations for c in row.cells]}
+            columns |= {"ess_min": [fewest(c.summary) for c in row.cells]}
             for name, values in columns.items():
                 known = np.array([v for v in values if v is not None], dtype=float)
                 centre = np.median if name == "time_s" else np.mean
@@ -244,16 +268,16 @@ def compare(words: list[str]) -> None:
     rows = gather(jobs)
     first = jobs[chosen.engines[0]][0]
     exact = exact_reference(first) if any(row.cells for row in rows) else None
-    records = tabulate(rows, exact)
+    records = tabulate(rows, exact, chosen.reference)
     key = hashlib.sha256("".join(job.name for jobs_ in jobs.values() for job in jobs_).encode()).hexdigest()[:8]
     pair = first.name.removesuffix(first.name[first.name.rindex(f"-{chosen.engines[0]}-") :])
     folder = first.folder.parent / f"compare-{pair}-{key}"
-    ran = [row.engine for row in rows if row.cells]
-    title = "exact posterior" if exact else f"posterior of {ran[0]}" if ran else "none, no engine ran"
+    best = reference_of(rows, chosen.reference)
+    title = "exact posterior" if exact else f"posterior of {best}" if best else "none, no engine ran"
     write(folder, records, rows, f"reference: {title}")
     print_table(records, f"reference: {title}")
     print(f"report     {folder / 'report.html'}")
-    if not ran or any(row.error and (chosen.named or not row.refused) for row in rows):
+    if best is None or any(row.error and (chosen.named or not row.refused) for row in rows):
         raise JobFailed(1)
 
 

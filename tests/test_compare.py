@@ -70,3 +70,14 @@ def test_the_distance_to_the_reference_follows_its_definition() -> None:
     reference = {"a": {"mean": 0.0, "sd": 1.0, "mcse": 0.4}, "b": {"mean": 0.0, "sd": 0.5, "mcse": 0.0}}
     distance = against(own, reference, by_position=False)
     assert distance == pytest.approx({"mean_error_sd": 0.5**0.5, "sd_ratio": 2.0, "z_max": 2.0})
+
+
+def test_the_reference_is_the_engine_named_where_it_ran() -> None:
+    summary = {"z": {"mean": 0.0, "sd": 2.0, "mcse": 0.1, "ess_bulk": 300.0}}
+    rough = {"z": {"mean": 1.0, "sd": 1.0, "mcse": 0.1, "ess_bulk": 90.0}}
+    rows = [Row(n, [Cell(Path(), {}, s, 1.0, None)], None, False) for n, s in (("rough", rough), ("good", summary))]
+    records = tabulate(rows, None, "good")
+    assert records[0]["sd_ratio"] == 0.5 and records[0]["ess_min"] == 90.0 and "sd_ratio" not in records[1]
+    assert tabulate([*rows, Row("lost", [], "no", True)], None, "lost")[1]["sd_ratio"] == 2.0  # of the first that ran
+    with pytest.raises(ConfigError, match="reference is 'smc'"):
+        plan(["engines=[nuts]", "reference=smc"])

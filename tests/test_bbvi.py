@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from inference import bbvi
-from inference.gradients import Gaussian, reading
+from inference.gradients import Gaussian, blocks, overdispersed, reading, reparameterised, score
 from inference.posterior import Posterior
 from inference.transform import standard, target_of
 from models.capability import Factors
@@ -98,6 +98,29 @@ def test_noise_annealing_falls_to_the_whole_likelihood() -> None:
     assert bbvi.share_of(plan._replace(annealed=0.0), 0) == 1.0
 
 
+@pytest.mark.parametrize("estimator", bbvi.ESTIMATORS)
+def test_a_step_follows_the_gradient_of_the_inflated_likelihood(estimator: str) -> None:
+    """Adam remembers a tenth of the first gradient and goes along its sign, by the whole rate at the first step."""
+    target = target_of(FACTORS, standard(5))
+    reads = reading(target, True)
+    parts = blocks(FACTORS.sites, reads, 24)
+    options = (reads, True, parts, True, False, False)
+    plan = bbvi.Plan(target, estimator, *options, num_steps=1000, learning_rate=0.1, inflation=5.0, annealed=0.4)
+    before = bbvi.first_state(plan, np.full(5, 0.2), 0.8, 1.5)
+    noise = np.random.default_rng(0).standard_normal((24, 5))
+    q, slopes = bbvi.q_of(plan, before.numbers), np.zeros(2)
+    if estimator == "reparameterised":
+        gradient = reparameterised(target, q, noise, 1 / 25)
+    elif estimator == "score":
+        gradient = score(target, q, noise, 1 / 25, reads, True)
+    else:
+        gradient, slopes = overdispersed(target, q, noise, 1 / 25, reads, True, parts, before.tau)
+    after = bbvi.step(plan, before, noise)
+    assert after.drift == pytest.approx(0.1 * gradient, rel=1e-12)
+    assert after.numbers - before.numbers == pytest.approx(0.1 * np.sign(gradient), rel=1e-4)
+    assert np.array_equal(after.tau > before.tau, slopes < 0.0)  # towards less variance
+
+
 def two_modes() -> Factors:
     """One number: 2 % of the likelihood in a narrow mode at -2, the rest in a wide one at 1."""
 
@@ -154,6 +177,28 @@ def test_what_is_left_to_gain_is_known_for_a_gaussian() -> None:
     gain, error = bbvi.gain_left(plan, q, noise, target.evaluate(q.draw(noise)))
     assert error < 0.01
     assert gain == pytest.approx(0.125, abs=4 * error)
+
+
+def test_what_is_left_to_gain_counts_curvature_and_no_noise() -> None:
+    """p = N(0, 1), q = N(m, s^2): g_mean = -m s, g_log_sd = 1 - s^2, c = s^2. Of few draws the noise is as large."""
+    unread = Hierarchy(num_groups=3, noise_std=1e6)
+    target = target_of(unread.factors(EVIDENCE), standard(5))
+    plan = bbvi.Plan(target, "score", reading(target, True), True, [], True, False, False, 1, 0.1, 1.0, 0.0)
+    for s, mean, num, repeats in ((0.5, 0.5, 20000, 1), (1.4, 0.0, 200, 400)):
+        q = Gaussian(np.array([mean, 0, 0, 0, 0]), np.log([s, 1, 1, 1, 1]))
+        noises = np.random.default_rng(0).standard_normal((repeats, num, 5))
+        found = [bbvi.gain_left(plan, q, noise, target.evaluate(q.draw(noise))) for noise in noises]
+        truth = 0.5 * mean**2 + 0.25 * (1 - s**2) ** 2
+        error = 4 * np.mean([e for _, e in found]) / np.sqrt(repeats)
+        assert np.mean([gain for gain, _ in found]) == pytest.approx(truth, abs=error)
+
+
+def test_a_weight_that_bears_all_is_flagged() -> None:
+    """A q so far off that every other weight is nothing beside the largest: no tail is left to fit."""
+    model = Hierarchy(num_groups=12, noise_std=1e-4)
+    posterior = bbvi.run(model, readings(model), seed=1, transform="prior", num_steps=2, **SHORT)
+    assert posterior.info["pareto_k"] == np.inf
+    assert any("Pareto tail of k = inf" in flag for flag in posterior.info["flags"])
 
 
 def test_tau_follows_the_variance() -> None:

@@ -133,6 +133,43 @@ def test_same_seed_same_bits_and_other_seed_other_draws() -> None:
     assert not np.array_equal(a, c)
 
 
+class Skewed(Line):
+    """a ~ N(MEAN, TRIL TRIL^T) alone, of which the sum of squares sees the whitened numbers."""
+
+    MEAN, TRIL = np.array([1.0, -2.0, 0.5]), np.array([[2.0, 0.0, 0.0], [0.7, 0.5, 0.0], [-0.4, 0.3, 3.0]])
+
+    def __call__(self, evidence: Readings) -> None:
+        prior = dist.MultivariateNormal(torch.from_numpy(self.MEAN), scale_tril=torch.from_numpy(self.TRIL))
+        mean = pyro.sample("a", prior) @ torch.from_numpy(evidence.design[:, :3]).T
+        pyro.sample("y", dist.Normal(mean, self.NOISE).to_event(1), obs=evidence.y)
+
+
+class CompiledSkewed(Skewed):
+    def squares(self, evidence: Readings) -> Squares:
+        slopes, gap = evidence.design[:, :3] @ self.TRIL, evidence.y.numpy() - evidence.design[:, :3] @ self.MEAN
+
+        def evaluate(z: Array, hessian: Array, gradient: Array) -> float:
+            residual = (slopes @ z - gap) / self.NOISE
+            hessian[:], gradient[:] = slopes.T @ slopes / self.NOISE**2, slopes.T @ residual / self.NOISE
+            return 0.5 * float(residual @ residual)
+
+        correlated = {"a": (self.MEAN, self.TRIL)}
+        const = -len(gap) * math.log(self.NOISE * math.sqrt(2 * math.pi))
+        return Squares(np.zeros(3), np.ones(3), {"a": slice(0, 3)}, {"a": (3,)}, evaluate, const, correlated)
+
+
+def test_correlated_priors_lead_to_the_same_as_their_program() -> None:
+    """Evidence, snapshots in natural units, and init, which is whitened."""
+    init = {"a": torch.tensor([0.3, 1.0, -2.0])}
+    compiled, traced = (least_squares.run(m, SEEN, seed=0, init=init) for m in (CompiledSkewed(), Skewed()))
+    np.testing.assert_allclose(compiled.estimate["a"], traced.estimate["a"], atol=1e-8)
+    assert compiled.log_evidence == pytest.approx(traced.log_evidence, abs=1e-8)
+    found = compiled.snapshots
+    np.testing.assert_allclose(found.states["a"][0], init["a"], atol=1e-6)
+    states = {"a": torch.from_numpy(found.states["a"])}
+    np.testing.assert_allclose(found.log_joint, log_joint(Skewed(), states, SEEN), rtol=1e-10)
+
+
 # Where it is not linear
 
 

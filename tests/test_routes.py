@@ -98,6 +98,15 @@ def test_a_track_seen_from_the_last_metres_of_its_entry_goes_by_these() -> None:
     np.testing.assert_array_equal(lanes_of(found), true)
 
 
+@pytest.mark.parametrize("num", [0, 1, 200])
+def test_distinct_rows_are_those_of_numpy(num: int) -> None:
+    rows = np.random.default_rng(num).integers(-1, 4, (num, 4))
+    expected, which = np.unique(rows, axis=0, return_inverse=True)
+    found = distinct(rows)
+    np.testing.assert_array_equal(found[0], expected)
+    np.testing.assert_array_equal(found[1], which.reshape(-1))
+
+
 def test_an_unnormalised_likelihood_is_refused() -> None:
     scene = protocol(0)
     model = Junction(likelihood="half", bend_std=0.0)

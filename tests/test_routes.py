@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from experiments.scenarios.protocol import protocol
 from experiments.scenarios.scene import JunctionTruth, Scene, join_tracks
-from models.intersection.routes import Routes, Routing, find_routes
+from models.intersection.routes import Routes, Routing, distinct, find_routes
 from models.intersection.state import Junction
 from models.intersection.tracks import Tracks
 from models.program import InputError

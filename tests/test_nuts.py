@@ -78,6 +78,12 @@ def test_same_seed_same_bits_and_chains_differ() -> None:
     assert not np.array_equal(first.draws["line"][0], first.draws["line"][1])
 
 
+def test_chains_that_begin_together_part() -> None:
+    """Their random numbers are their own, not only where they begin."""
+    posterior = nuts.run(MODEL, EVIDENCE, seed=3, num_chains=2, num_draws=8, warmup=8, spread=0.0)
+    assert not np.array_equal(posterior.draws["line"][0], posterior.draws["line"][1])
+
+
 def test_the_global_random_numbers_are_left_alone() -> None:
     torch.manual_seed(5)
     expected = torch.rand(1)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from inference import transform
 from inference.factors import factored
 from inference.transform import Affine, laplace, standard, target_of, whitening
 from models.capability import Factors
@@ -56,8 +57,8 @@ def test_gradient_is_that_of_the_tempered_density(share: float) -> None:
 
 def test_a_factor_depends_on_exactly_the_numbers_that_move_it() -> None:
     affine, _, _ = laplace(MODEL, EVIDENCE, FACTORS, np.zeros(6))
-    for transform in (standard(6), affine):
-        target = target_of(FACTORS, transform)
+    for coordinates in (standard(6), affine):
+        target = target_of(FACTORS, coordinates)
         here = target.evaluate(U)
         for d in range(6):
             there = target.evaluate(U + 0.1 * np.eye(6)[d])
@@ -121,6 +122,13 @@ def test_a_saddle_is_flagged_and_no_wider_than_the_prior() -> None:
     affine, _, flags = laplace(None, None, bumpy(3.0), np.zeros(1))
     assert len(flags) == 1 and "eigenvalue of -2" in flags[0]
     assert affine.tril == pytest.approx(np.ones((1, 1)))
+
+
+def test_a_mode_that_was_not_reached_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transform, "NUM_STEPS", 1)
+    rough = bumpy(0.0)._replace(evaluate=lambda x: -(x**4), gradient=lambda x: (-(x[:, 0] ** 4), -4.0 * x**3))
+    _, _, flags = laplace(None, None, rough, np.full(1, 30.0))
+    assert len(flags) == 1 and "the mode was not found" in flags[0] and "give an init closer to it" in flags[0]
 
 
 def test_prior_whitening_begins_at_init_and_laplace_at_the_mode() -> None:

@@ -69,7 +69,7 @@ def test_the_models_own_moves_give_the_exact_evidence_and_means() -> None:
         return [posterior.log_evidence, *posterior.mean("beta")]
 
     def run(seed: int) -> Posterior:
-        return smc.run(MODEL, EVIDENCE, seed=seed, moves="model", num_particles=100)
+        return smc.run(MODEL, EVIDENCE, seed=seed, moves="model", num_particles=100, num_moves=10)
 
     found = scores(run, what, [log_evidence, *mean], 15)
     assert found.max() < 4.5, found

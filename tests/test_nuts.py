@@ -39,7 +39,7 @@ def test_the_potential_has_the_gradient_of_the_density_wherever_it_is_asked() ->
 @pytest.mark.parametrize("transform", ["prior", "laplace"])
 def test_means_and_deviations_of_a_hierarchy_are_exact(transform: Any) -> None:
     """Four standard errors of ArviZ, autocorrelation included; of the squares too."""
-    posterior = nuts.run(MODEL, EVIDENCE, seed=1, transform=transform, num_chains=2, num_draws=100, warmup=60)
+    posterior = nuts.run(MODEL, EVIDENCE, seed=1, transform=transform, num_chains=2, num_draws=60, warmup=40)
     mean, covariance, _ = MODEL.exact(EVIDENCE)
     scale = np.array([1.0, 1.0, MODEL.offset_std, MODEL.offset_std])
     draws = np.concatenate([posterior.draws["line"], posterior.draws["offset"]], -1) / scale

@@ -27,9 +27,11 @@ def measurements() -> tuple[fig.Measurement, ...]:
         junction_speed,
         junction_structure,
         junction_traffic,
+        lane_families,
     )
 
-    parts = (junction_speed, junction_structure, junction_likelihoods, junction_lanes, junction_maps, junction_traffic)
+    structure = (junction_speed, junction_structure, junction_likelihoods)
+    parts = (*structure, junction_lanes, lane_families, junction_maps, junction_traffic)
     return tuple(measurement for part in parts for measurement in part.MEASUREMENTS)
 
 

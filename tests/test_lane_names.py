@@ -48,3 +48,9 @@ def test_one_stub_is_recognised_though_its_lanes_were_seen_from_different_distan
 def test_where_every_lane_ends_inside_there_is_no_arm() -> None:
     names, angle = name_lanes([straight((-10, 0), (10, 0))], np.array([2]), CENTRE)
     assert len(angle) == 0 and names.tolist() == [[-1, 0, -1, 0]]
+
+
+def test_a_lane_of_a_few_metres_has_names_too() -> None:
+    names, angle = name_lanes([straight((30, 2), (23, 2)), straight((-60, -2), (60, -2))], np.full(2, 2), CENTRE)
+    east = int(np.abs(np.angle(np.exp(1j * angle))).argmin())
+    assert names[0].tolist() == [east, 0, -1, 0] and names[1, 2] == east

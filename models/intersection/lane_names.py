@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 FROM = 15.0  # [m] from the centre: closer in, lanes turn
 POINTING = math.radians(60.0)  # between an end's direction and the way it lies, at most
-END = 10  # points of a curve, a metre apart, that show its outward direction
+END = 10  # points of a curve, a metre apart, that show its outward direction, or all where it is shorter
 TOGETHER = 18.0  # [m] of the outer ends of lanes of one stub
 AT = 25.0  # [m] along the arm where stubs are counted, or as near to it as they were seen
 
@@ -37,7 +37,7 @@ def name_lanes(curves: list[Array], weights: Ints, centre: Array) -> tuple[Ints,
     An end on no arm has arm -1 and a number of its own for a lane, so that no two lanes share it."""
     connections = np.empty((len(curves), 4), dtype=np.int64)
     outwards = [[curve, curve[::-1]] for curve in curves]  # both from the outer end on
-    pointing = np.array([[_direction(line[END], line[0]) for line in pair] for pair in outwards])  # (L, 2)
+    pointing = np.array([[_direction(line[: END + 1][-1], line[0]) for line in pair] for pair in outwards])  # (L, 2)
     place = np.array([[line[0] - centre for line in pair] for pair in outwards])  # (L, 2, 2)
     off = np.abs(wrap(np.arctan2(place[..., 1], place[..., 0]) - pointing))
     on_arm = (np.linalg.norm(place, axis=-1) >= FROM) & (off <= POINTING)

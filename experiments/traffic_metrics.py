@@ -103,7 +103,11 @@ def _beside(points: Floats, heading: Floats, line: Floats) -> tuple[Floats, Flag
 
 
 def _quantile(values: Floats, q: float) -> float:
-    return float(np.quantile(values, q)) if len(values) else math.nan
+    """Infinite where one of the two values beside it is: numpy would say nan."""
+    if len(values) == 0:
+        return math.nan
+    above = float(np.quantile(values, q, method="higher"))
+    return float(np.quantile(values, q)) if math.isfinite(above) else above
 
 
 def _share(flags: Flags) -> float:

@@ -57,6 +57,13 @@ def test_a_lane_of_the_other_direction_is_not_near() -> None:
     assert score(found(straight((30, 3), (-30, 3))), drawn_map(EAST, WEST), TRACKS)["traffic_m"] == pytest.approx(0.0)
 
 
+def test_where_the_map_has_no_lane_of_the_direction_distances_are_infinite() -> None:
+    """20 points of 40 run across the only map lane: more than a tenth of them, and half."""
+    scores = score(found(straight((-30, 0), (-10, 0)), straight((5, -30), (5, -10))), drawn_map(EAST), TRACKS)
+    assert scores["traffic_p90_m"] == scores["traffic_m"] == math.inf
+    assert scores["traffic_precision_1m"] == 0.5
+
+
 def test_points_beyond_the_end_of_the_map_are_left_out() -> None:
     scores = score(found(straight((20, 0), (90, 0))), drawn_map(EAST), TRACKS)
     assert scores["traffic_p90_m"] == pytest.approx(0.0, abs=1e-9) and scores["traffic_precision_1m"] == 1.0

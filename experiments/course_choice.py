@@ -1,7 +1,8 @@
 """Lane courses of the family that the tracks speak for.
 
 Both families are densities of where the same points lie across their lanes, given where along them: their evidences
-differ by the odds of the families, if both are as probable before. Either learns scales of its priors.
+differ by the odds of the families, if both are as probable before. Either learns scales of its priors. Border points
+are data of LaneCourses alone: with them the evidences are of different data, and there is no choice.
 """
 
 from __future__ import annotations
@@ -49,10 +50,14 @@ def fit(
 
     prepared  evidence of the courses that are no rival, if there is some already
 
-    Raises InputError where the engine tells no evidence to choose by."""
+    Raises InputError where the engine tells no evidence to choose by, or border points are part of one alone."""
     if not isinstance(courses, Choice):
         evidence = courses.prepare(routed) if prepared is None else prepared
         return Fitted(refine(courses, evidence, seed=seed), evidence)
+    if routed.tracks.borders is not None:
+        raise InputError(
+            "border points are data of LaneCourses alone, so evidences do not compare; drop them or the rival"
+        )
     own, rival = courses
     engine = partial(refine, learn=tuple(rival.learn))
     both = [fit(refine, own, routed, seed, prepared), fit(engine, rival.courses, routed, seed)]

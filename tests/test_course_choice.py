@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 from experiments.course_choice import Choice, Rival, fit
@@ -38,6 +39,12 @@ def test_the_larger_evidence_wins_and_tells_by_how_much(arms: float, free: float
 def test_without_evidence_there_is_no_choice() -> None:
     with pytest.raises(InputError, match="tells no evidence"):
         fit(lambda model, evidence, seed, learn=(): Posterior(draws={}), CHOICE, ROUTED, 0)
+
+
+def test_border_points_that_one_family_alone_scores_leave_no_choice() -> None:
+    marked = ROUTED._replace(tracks=ROUTED.tracks._replace(borders=np.zeros((1, 2))))
+    with pytest.raises(InputError, match="border points are data of LaneCourses alone"):
+        fit(lambda model, evidence, seed, learn=(): Posterior(draws={}, log_evidence=0.0), CHOICE, marked, 0)
 
 
 @pytest.mark.parametrize("courses", [LaneCourses(), FreeCourses()])

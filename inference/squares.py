@@ -161,7 +161,7 @@ def run(
     states = np.stack(visited)
     priors = 0.5 * np.square((states - squares.loc) / path.scale).sum(1)  # of the last scales: one density for all
     scales = {name: float(path.scale[part][0]) for name, part in squares.sites.items() if name in learn}
-    steps, volume = len(states) - 1, 0.5 * len(x) * np.log(2 * np.pi) + squares.log_volume
+    steps, volume = len(states) - 1, 0.5 * len(x) * np.log(2 * np.pi) + squares.log_volume(states)
     flag = f"not converged after {num_steps} steps; raise num_steps or start closer (init)"
     if steps < num_steps:
         left = f"{0.5 * squared_norm(path.factor, path.state.gradient):.2g}"

@@ -143,6 +143,19 @@ def pointer(function: Any) -> Any:
     return Pointer()
 
 
+class Chart(NamedTuple):
+    """A site in numbers z of its own.
+
+    forward     z (*batch, n) -> the site (*batch, n)
+    inverse     the site (n,) -> z (n,)
+    log_volume  z (*batch, n) -> log |d site / dz| (*batch)
+    """
+
+    forward: Callable[[np.ndarray], np.ndarray]
+    inverse: Callable[[np.ndarray], np.ndarray]
+    log_volume: Callable[[np.ndarray], np.ndarray]
+
+
 class Squares(NamedTuple):
     """A program of normal latents whose observations are a sum of squares in machine code.
 
@@ -154,7 +167,7 @@ class Squares(NamedTuple):
     evaluate    (z, hessian, gradient (D,)) -> cost; fills the Gauss-Newton model of the cost at z: hessian (D, D), or
                 (L, P, P) with `blocks`, of which the lower triangles are read
     log_const   of the observations: log p(y | z) = log_const - cost(z)
-    correlated  {site: (mean, tril)} where the prior of a site is not diagonal: the site is mean + tril z
+    charts      {site: Chart} where a site is not z itself: the density above is that of z, whatever its prior is
     blocks      (L, P) for a Hessian that is a sum of L small ones: the latents that meet in each, -1 for none. A plate
                 makes such sums, and latents that are in one block only are solved for by themselves, which is quicker
     """
@@ -165,19 +178,19 @@ class Squares(NamedTuple):
     shapes: dict[str, tuple[int, ...]]
     evaluate: Callable[[np.ndarray, np.ndarray, np.ndarray], float]
     log_const: float
-    correlated: Mapping[str, tuple[np.ndarray, np.ndarray]] = MappingProxyType({})
+    charts: Mapping[str, Chart] = MappingProxyType({})
     blocks: np.ndarray | None = None
 
     def unpack(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """(*batch, D) to {site: (*batch, *event)}."""
         latents = {n: z[..., part] for n, part in self.sites.items()}
-        latents |= {n: mean + latents[n] @ tril.T for n, (mean, tril) in self.correlated.items()}
+        latents |= {n: chart.forward(latents[n]) for n, chart in self.charts.items()}
         return {n: v.reshape(z.shape[:-1] + self.shapes[n]) for n, v in latents.items()}
 
     def pack(self, latents: dict[str, Any]) -> np.ndarray:
         """{site: (*event)} to (D,)."""
         z = {n: np.asarray(latents[n], dtype=np.float64).reshape(-1) for n in self.sites}
-        z |= {n: np.linalg.solve(tril, z[n] - mean) for n, (mean, tril) in self.correlated.items()}
+        z |= {n: chart.inverse(z[n]) for n, chart in self.charts.items()}
         return np.concatenate([z[n] for n in self.sites])
 
     def dense(self, z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -194,10 +207,10 @@ class Squares(NamedTuple):
         lower = np.tril(hessian[:size, :size])
         return cost, lower + np.tril(lower, -1).T, gradient
 
-    @property
-    def log_volume(self) -> float:
-        """log |d latents / dz|."""
-        return float(sum(np.log(np.diag(tril)).sum() for _, tril in self.correlated.values()))
+    def log_volume(self, z: np.ndarray) -> np.ndarray:
+        """log |d latents / dz| at z (*batch, D), (*batch)."""
+        parts = [chart.log_volume(z[..., self.sites[n]]) for n, chart in self.charts.items()]
+        return np.asarray(sum(parts, start=np.zeros(z.shape[:-1])))
 
 
 @runtime_checkable

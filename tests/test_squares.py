@@ -15,7 +15,7 @@ from torch import Tensor
 
 from inference import least_squares, squares
 from inference.posterior import Posterior
-from models.capability import Squares
+from models.capability import Chart, Squares
 from models.program import InputError, log_joint
 
 Array = NDArray[np.float64]
@@ -153,9 +153,13 @@ class CompiledSkewed(Skewed):
             hessian[:], gradient[:] = slopes.T @ slopes / self.NOISE**2, slopes.T @ residual / self.NOISE
             return 0.5 * float(residual @ residual)
 
-        correlated = {"a": (self.MEAN, self.TRIL)}
+        chart = Chart(
+            forward=lambda z: self.MEAN + z @ self.TRIL.T,
+            inverse=lambda a: np.linalg.solve(self.TRIL, a - self.MEAN),
+            log_volume=lambda z: np.full(z.shape[:-1], np.log(np.diag(self.TRIL)).sum()),
+        )
         const = -len(gap) * math.log(self.NOISE * math.sqrt(2 * math.pi))
-        return Squares(np.zeros(3), np.ones(3), {"a": slice(0, 3)}, {"a": (3,)}, evaluate, const, correlated)
+        return Squares(np.zeros(3), np.ones(3), {"a": slice(0, 3)}, {"a": (3,)}, evaluate, const, {"a": chart})
 
 
 def test_correlated_priors_lead_to_the_same_as_their_program() -> None:

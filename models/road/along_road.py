@@ -22,7 +22,7 @@ from models.clothoid import Points, evaluate, hermite
 from models.program import InputError
 from models.road.cue_kernel import WIDTH
 from models.road.evidence import RoadEvidence
-from models.road.kernel import explain, normal_equations
+from models.road.kernel import explain, slopes_in_course
 
 if TYPE_CHECKING:
     from models.road.course import RoadCourse
@@ -64,10 +64,10 @@ class CuesAlongRoad(TorchDistribution):
         """Residuals across the road and of the direction, and the probability of following the road, (*B, N, 3)."""
         numbers = torch.cat([self.course, self.offset], -1).detach().reshape(-1, self.offset.shape[-1] + 6).numpy()
         rows = value.detach().expand((*self.batch_shape, *self.event_shape)).reshape(len(numbers), -1, 3).numpy()
-        out = np.empty_like(rows)
+        out, settings = np.empty_like(rows), kernel_settings(self.model)
         for i, z in enumerate(numbers):
             cues = cue_arrays(self.model, self.evidence, rows[i])
-            explain(z, *natural(self.model), *cues, out[i])  # type: ignore[call-arg]
+            explain(z, *settings, *cues, out[i])  # type: ignore[call-arg]
         return torch.from_numpy(out).reshape((*self.batch_shape, *self.event_shape))
 
 
@@ -91,9 +91,9 @@ def scatter(points: Points, offset: Tensor, evidence: RoadEvidence, model: RoadC
     return torch.stack([x, y, torch.where(torch.from_numpy(measured), direction, 0.0)], -1)
 
 
-def natural(model: RoadCourse) -> tuple[Any, ...]:
-    """Arguments of the kernels for courses in natural numbers."""
-    return np.zeros(6), np.eye(6), model.num_samples, model.likelihood == "paper"
+def kernel_settings(model: RoadCourse) -> tuple[int, bool]:
+    """What the kernels read of a model: samples of a course, and whether as printed."""
+    return model.num_samples, model.likelihood == "paper"
 
 
 def cue_arrays(model: RoadCourse, evidence: RoadEvidence, cues: Floats) -> tuple[Floats, NDArray[np.int64]]:
@@ -123,13 +123,13 @@ class _LogProb(torch.autograd.Function):
     def forward(ctx: Any, numbers: Tensor, value: Tensor, model: RoadCourse, evidence: RoadEvidence) -> Tensor:
         rows = numbers.detach().reshape(-1, numbers.shape[-1]).numpy()
         seen = value.detach().reshape(len(rows), -1, 3)
-        height, slope, empty = np.empty(len(rows)), np.empty_like(rows), np.empty((0, 0))
+        height, slope, settings = np.empty(len(rows)), np.empty_like(rows), kernel_settings(model)
         same = value.dim() == 2 or all(step == 0 for step in value.stride()[:-2])
         fixed = cue_arrays(model, evidence, seen[0].numpy()) if same else None
         for i, z in enumerate(rows):
             cues = fixed or cue_arrays(model, evidence, seen[i].numpy())
-            height[i] = -normal_equations(z, *natural(model), *cues, empty, slope[i])  # type: ignore[call-arg]
-        ctx.save_for_backward(numbers, torch.from_numpy(-slope).reshape(numbers.shape))
+            height[i] = slopes_in_course(z, *settings, *cues, slope[i])  # type: ignore[call-arg]
+        ctx.save_for_backward(numbers, torch.from_numpy(slope).reshape(numbers.shape))
         return torch.from_numpy(height).reshape(numbers.shape[:-1])
 
     @staticmethod

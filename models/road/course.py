@@ -30,15 +30,17 @@ import pyro
 import pyro.distributions as dist
 import torch
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 from scipy.special import ndtri
 
-from models.capability import Factors, Squares
+from models.capability import Chart, Factors, Squares
 from models.program import InputError
-from models.road.along_road import CuesAlongRoad, cue_arrays
+from models.road.along_road import CuesAlongRoad, cue_arrays, kernel_settings
 from models.road.cue_kernel import SPREAD
 from models.road.cues import KINDS, CueKind, Cues
 from models.road.evidence import RoadEvidence, road_evidence
 from models.road.kernel import density_slopes, group_densities, normal_equations
+from models.road.numbers import log_volumes, number_moments, prior_root, to_courses, to_numbers
 from models.road.prior import USUAL_ROADS, CoursePrior, course_moments
 
 Floats = NDArray[np.float64]
@@ -93,31 +95,30 @@ class RoadCourse:
         The posterior has modes where rows of cues are taken for clutter or for the other side of a bend, and descent
         from the prior's middle often ends in them. Fog is spread added to that of the cues (`FOGS`)."""
         loc, std = evidence.offset_loc, evidence.offset_std
-        mean, tril, num, paper, cues, group = self._kernel(evidence)
+        course, num, paper, cues, group = self._kernel(evidence)
         centre, scale = np.r_[np.zeros(6), loc], np.r_[np.ones(6), std]
-        x, sharp = first_roads(len(loc)), cues[:, SPREAD].copy()
+        roads, sharp = first_roads(self.prior), cues[:, SPREAD].copy()
+        x = np.concatenate([roads, np.zeros((len(roads), len(loc)))], 1)
         cues[:, SPREAD] = sharp + FOGS[0] ** 2
-        heights = np.empty((len(x), len(loc)))
-        group_densities(x, mean, tril, num, paper, cues, group, loc, std, heights)  # type: ignore[call-arg]
-        best = x[np.argmax(heights.sum(-1))]
-        hessian, gradient = np.empty((len(best), len(best))), np.empty(len(best))
+        heights = np.empty((len(x), 1 + len(loc)))
+        group_densities(x, course, num, paper, cues, group, loc, std, heights)  # type: ignore[call-arg]
+        best = x[np.argmax(heights[:, 1:].sum(-1))]
+        hessian, gradient = np.zeros((len(best), len(best))), np.empty(len(best))
         for fog in FOGS:
             cues[:, SPREAD] = sharp + fog**2
-            z = centre + scale * best
-            normal_equations(z, mean, tril, num, paper, cues, group, hessian, gradient)  # type: ignore[call-arg]
+            normal_equations(centre + scale * best, course, num, paper, cues, group, hessian, gradient)  # type: ignore[call-arg]
             whole = np.eye(len(best)) + scale[:, None] * hessian * scale
-            best = best - np.linalg.solve(whole, best + scale * gradient)
-        return {"course": mean + tril @ best[:6], "offset": loc + std * best[6:]}
+            best = best - dposv(whole, best + scale * gradient, lower=1)[1]
+        return {"course": to_courses(best[:6], self.prior), "offset": loc + std * best[6:]}
 
     def factors(self, evidence: RoadEvidence) -> Factors:
-        """One factor for each group of cues: it reads the course and its own offset."""
-        mean, tril = course_moments(self.prior)
+        """One factor of the course, and one for each group of cues, which reads the course and its own offset."""
         loc, std = evidence.offset_loc, evidence.offset_std
         arguments = (*self._kernel(evidence), loc, std)
         num = len(loc)
 
         def evaluate(x: Floats) -> Floats:
-            out = np.empty((len(x), num))
+            out = np.empty((len(x), 1 + num))
             group_densities(np.ascontiguousarray(x), *arguments, out)  # type: ignore[call-arg]
             return out
 
@@ -127,13 +128,14 @@ class RoadCourse:
             return height, slope
 
         def latents(x: Floats) -> dict[str, Floats]:
-            return {"course": mean + x[..., :6] @ tril.T, "offset": loc + std * x[..., 6:]}
+            return {"course": to_courses(x[..., :6], self.prior), "offset": loc + std * x[..., 6:]}
 
         def whiten(state: dict[str, Any]) -> Floats:
-            course, offset = (np.asarray(state[name], dtype=np.float64) for name in ("course", "offset"))
-            return np.concatenate([np.linalg.solve(tril, course - mean), (offset - loc) / std])
+            offset = np.asarray(state["offset"], dtype=np.float64)
+            return np.concatenate([to_numbers(state["course"], self.prior), (offset - loc) / std])
 
-        depends = np.hstack([np.ones((num, 6), dtype=bool), np.eye(num, dtype=bool)])
+        groups = np.eye(1 + num, dtype=bool)[:, 1:]
+        depends = np.concatenate([np.ones((1 + num, 6), dtype=bool), groups], 1)
         sites = {"course": slice(0, 6), "offset": slice(6, 6 + num)}
         return Factors(evaluate, gradient, depends, sites, latents, whiten)
 
@@ -143,15 +145,15 @@ class RoadCourse:
         loc, scale = np.r_[np.zeros(6), evidence.offset_loc], np.r_[np.ones(6), evidence.offset_std]
         sites = {"course": slice(0, 6), "offset": slice(6, 6 + num)}
         evaluate = partial(_evaluate, self._kernel(evidence))
-        correlated = {"course": course_moments(self.prior)}
-        return Squares(loc, scale, sites, {"course": (6,), "offset": (num,)}, evaluate, 0.0, correlated=correlated)
+        chart = Chart(*(partial(part, prior=self.prior) for part in (to_courses, to_numbers, log_volumes)))
+        return Squares(loc, scale, sites, {"course": (6,), "offset": (num,)}, evaluate, 0.0, {"course": chart})
 
     def _kernel(self, evidence: RoadEvidence) -> tuple[Any, ...]:
         """What every kernel reads of the model and its evidence."""
         if evidence.cues is None:
             raise InputError("this evidence has no cues (they await simulation); give them before inference")
-        settings = (*course_moments(self.prior), self.num_samples, self.likelihood == "paper")
-        return (*settings, *cue_arrays(self, evidence, evidence.cues.numpy()))
+        course = (*number_moments(self.prior), *prior_root(self.prior))
+        return course, *kernel_settings(self), *cue_arrays(self, evidence, evidence.cues.numpy())
 
 
 def _evaluate(arguments: tuple[Any, ...], z: Floats, hessian: Floats, gradient: Floats) -> float:
@@ -159,9 +161,8 @@ def _evaluate(arguments: tuple[Any, ...], z: Floats, hessian: Floats, gradient: 
 
 
 @functools.lru_cache
-def first_roads(num_groups: int) -> Floats:
-    """Whitened numbers (S, 6 + G) of roads that end at evenly probable places, in evenly probable directions there."""
-    ends = [ndtri((np.arange(num) + 0.5) / num) for num in FIRST_ROADS]
-    x = np.zeros((math.prod(FIRST_ROADS), 6 + num_groups))
-    x[:, 4:6] = list(itertools.product(*ends))
-    return x
+def first_roads(prior: CoursePrior) -> Floats:
+    """Whitened numbers (S, 6) of roads that end at evenly probable places, in evenly probable directions there."""
+    mean, tril = course_moments(prior)
+    ends = list(itertools.product(*(ndtri((np.arange(num) + 0.5) / num) for num in FIRST_ROADS)))
+    return np.stack([to_numbers(mean + tril[:, 4:] @ end, prior) for end in ends])

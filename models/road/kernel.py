@@ -1,11 +1,14 @@
 """The density of all cues in machine code: group by group, with its gradient, and as normal equations.
 
-Numbers of the course are whitened, C = mean + tril x; offsets are in metres here. Groups share an offset, so that the
-log density is a sum over groups g of f_g(x, o_g). A course that no sane clothoid joins has NO_ROAD in every group: low
-enough for any engine to leave it, and finite, so that none breaks.
+Everything is computed in the numbers of the clothoid. What comes from C passes through the Hermite fit first
+(`slopes_in_course`); engines run on the whitened numbers of models.road.numbers. Groups share an offset, so that the log
+density is one factor of the course and a sum over groups g of f_g(theta, o_g). Where there is no sane clothoid every
+factor is NO_ROAD: low enough for any engine to leave it, and finite, so that none breaks.
 """
 
 from __future__ import annotations
+
+import math
 
 import numba as nb
 import numpy as np
@@ -13,60 +16,60 @@ import numpy as np
 from models.clothoid_kernel import COLUMNS, COS, LENGTH, SIN, hermite_one, sample_one
 from models.road.course_slopes import hermite_slopes, moments, sample_row
 from models.road.cue_kernel import nearest_sample, score_cue
+from models.road.numbers import affine, course_density
 
 NO_ROAD = -1e9  # [nats]
+LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
 
 
 @nb.njit(error_model="numpy")
-def lay_course(z, mean, tril, course, clothoid, table):  # type: ignore[no-untyped-def]
-    """Course (6,), clothoid (6,) and samples of the whitened numbers z[:6]; returns their step, inf for no road."""
+def correction(x, mean, tril, root_mean, root, theta, gradient, hessian):  # type: ignore[no-untyped-def]
+    """theta (6,) of x and the factor of the course, log N(C; ..) + log |dC / dx| - log N(x; 0, 1); -inf for no road."""
+    affine(x, mean, tril, theta)
+    height = course_density(theta, root_mean, root, gradient, hessian)
     for i in range(6):
-        course[i] = mean[i]
-        for j in range(i + 1):
-            course[i] += tril[i, j] * z[j]
-    hermite_one(course[0], course[1], course[2], course[3], course[4], course[5], clothoid)
-    return sample_one(clothoid, table) if clothoid[LENGTH] < np.inf else np.inf
+        height += math.log(tril[i, i]) + 0.5 * x[i] * x[i] + LOG_ROOT
+    return height
 
 
 @nb.njit(cache=True, error_model="numpy")
-def group_densities(x, mean, tril, num, paper, cues, group, loc, std, out):  # type: ignore[no-untyped-def]
-    """Log densities of the groups, out (S, G), at whitened numbers x (S, 6 + G).
+def group_densities(x, course, num, paper, cues, group, loc, std, out):  # type: ignore[no-untyped-def]
+    """Factors, out (S, 1 + G): of the course, then log densities of the groups, at whitened numbers x (S, 6 + G).
 
-    num    of samples of the course
-    paper  whether as printed
-    cues   (N, WIDTH) as in models.road.cue_kernel, group (N,) of each
+    course  (mean, tril) of theta and (mean, root) of C, as in models.road.numbers
+    num     of samples of the course
+    paper   whether as printed
+    cues    (N, WIDTH) as in models.road.cue_kernel, group (N,) of each
     loc, std  (G,) of the offsets"""
-    course, clothoid, table, rows = np.empty(6), np.empty(6), np.empty((num, COLUMNS)), np.empty((0, 6))
+    theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((0, 6))
+    none, empty = np.empty(0), np.empty((0, 0))
     for i in range(len(x)):
-        step = lay_course(x[i], mean, tril, course, clothoid, table)
-        for g in range(len(loc)):
-            out[i, g] = 0.0 if step < np.inf else NO_ROAD
-        if step == np.inf:
+        height = correction(x[i], *course, theta, none, empty)
+        out[i] = 0.0 if height > -np.inf else NO_ROAD
+        if height == -np.inf:
             continue
+        out[i, 0] = height
+        step = sample_one(theta, table)
         for n in range(len(cues)):
             g, k = group[n], nearest_sample(cues, n, table, step)
             offset = loc[g] + std[g] * x[i, 6 + g]
-            out[i, g] += score_cue(paper, cues, n, offset, table, k, rows)[0]
+            out[i, 1 + g] += score_cue(paper, cues, n, offset, table, k, rows)[0]
 
 
 @nb.njit(error_model="numpy")
-def linearise(z, mean, tril, num, paper, cues, group, gradient, hessian):  # type: ignore[no-untyped-def]
-    """Log density of all cues at z (6 + G,), whitened course and offsets [m]; its gradient (6 + G,) and, unless empty,
-    minus its expected second derivatives (6 + G, 6 + G)."""
-    size, full = len(z), len(hessian) > 0
-    course, clothoid, table, rows = np.empty(6), np.empty(6), np.empty((num, COLUMNS)), np.empty((3, 6))
+def linearise(theta, offset, num, paper, cues, group, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Log density of all cues beside the clothoid theta (6,) at offsets (G,) [m]; its gradient (6 + G,) in both and,
+    unless empty, minus its expected second derivatives (6 + G, 6 + G), of which the lower half is filled."""
+    full = len(hessian) > 0
+    table, rows = np.empty((num, COLUMNS)), np.empty((3, 6))
+    moment, row = np.empty((num, 4)), np.empty(6)
+    step, total = sample_one(theta, table), 0.0
+    moments(table, step, moment)
     gradient[:] = 0.0
     hessian[:] = 0.0
-    step = lay_course(z, mean, tril, course, clothoid, table)
-    if step == np.inf:
-        return (size - 6) * NO_ROAD
-    moment, row = np.empty((num, 4)), np.empty(6)
-    moments(table, step, moment)
-    by_shape, square = np.zeros(6), np.zeros((6, 6))  # in the clothoid's numbers
-    mixed, total = np.zeros((size, 6)), 0.0
     for n in range(len(cues)):
         k, o = nearest_sample(cues, n, table, step), 6 + group[n]
-        log_density, weight = score_cue(paper, cues, n, z[o], table, k, rows)
+        log_density, weight = score_cue(paper, cues, n, offset[group[n]], table, k, rows)
         total += log_density
         c, s = table[k, COS], table[k, SIN]
         dx, dy = cues[n, 0] - table[k, 0], cues[n, 1] - table[k, 1]
@@ -74,91 +77,125 @@ def linearise(z, mean, tril, num, paper, cues, group, gradient, hessian):  # typ
         for r in range(3):
             residual, u, v, by_offset = rows[r, 0], rows[r, 1], rows[r, 2], rows[r, 5]
             turn = rows[r, 3] + u * across - v * along
-            sample_row(v * s - u * c, -u * s - v * c, turn, rows[r, 4], k, clothoid, table, moment, row)
+            sample_row(v * s - u * c, -u * s - v * c, turn, rows[r, 4], k, theta, table, moment, row)
             gradient[o] -= weight * residual * by_offset
             for i in range(6):
-                by_shape[i] -= weight * residual * row[i]
+                gradient[i] -= weight * residual * row[i]
             if full:
                 hessian[o, o] += weight * by_offset**2
                 for i in range(6):
-                    mixed[o, i] += weight * by_offset * row[i]
+                    hessian[o, i] += weight * by_offset * row[i]
                     for j in range(i + 1):
-                        square[i, j] += weight * row[i] * row[j]
-    slopes = course_slopes(course, clothoid, tril)
-    for j in range(6):
-        for i in range(6):
-            gradient[j] += slopes[i, j] * by_shape[i]
-    if full:
-        whiten_course(square, mixed, slopes, hessian)
+                        hessian[i, j] += weight * row[i] * row[j]
     return total
 
 
 @nb.njit(error_model="numpy")
-def course_slopes(course, clothoid, tril):  # type: ignore[no-untyped-def]
-    """d clothoid / d x, (6, 6): of its numbers in the whitened course."""
-    fit, out = np.empty((3, 6)), np.zeros((6, 6))
-    hermite_slopes(course, clothoid, fit)
+def whiten(tril, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Gradient (6 + G,) and the lower half of a Hessian (6 + G, 6 + G) in theta become those in x, in place."""
+    left = np.empty(6)
     for j in range(6):
-        for i in range(3):
-            out[i, j] = tril[i, j]
+        total = 0.0
+        for i in range(j, 6):
+            total += tril[i, j] * gradient[i]
+        gradient[j] = total  # what comes later reads later numbers only
+    if len(hessian) == 0:
+        return
+    half = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            half[i, j] = 0.0
             for m in range(j, 6):
-                out[3 + i, j] += fit[i, m] * tril[m, j]
-    return out
+                half[i, j] += (hessian[i, m] if m <= i else hessian[m, i]) * tril[m, j]
+    for i in range(6):
+        for j in range(i + 1):
+            hessian[i, j] = 0.0
+            for m in range(i, 6):
+                hessian[i, j] += tril[m, i] * half[m, j]
+    for o in range(6, len(hessian)):
+        for j in range(6):
+            left[j] = 0.0
+            for m in range(j, 6):
+                left[j] += hessian[o, m] * tril[m, j]
+        hessian[o, :6] = left
 
 
 @nb.njit(error_model="numpy")
-def whiten_course(square, mixed, slopes, hessian):  # type: ignore[no-untyped-def]
-    """The Hessian (6 + G, 6 + G) from its blocks in the clothoid's numbers: square (6, 6), its lower half, and mixed
-    (6 + G, 6), where the offsets' rows count."""
-    half = np.zeros((6, 6))
+def whitened_slopes(x, offset, course, num, paper, cues, group, gradient, hessian):  # type: ignore[no-untyped-def]
+    """All factors together at whitened x (6,) of the course and offsets (G,) [m]: their sum, its gradient (6 + G,) in
+    these and, unless empty, the lower half of minus its second derivatives, after Gauss and Newton."""
+    theta, by_course = np.empty(6), np.empty(6)
+    square = np.empty((6, 6)) if len(hessian) > 0 else np.empty((0, 0))
+    height = correction(x, *course, theta, by_course, square)
+    if height == -np.inf:
+        gradient[:] = 0.0
+        hessian[:] = 0.0
+        return (1 + len(offset)) * NO_ROAD
+    height += linearise(theta, offset, num, paper, cues, group, gradient, hessian)
     for i in range(6):
-        for j in range(6):
-            for m in range(6):
-                half[i, j] += (square[i, m] if m <= i else square[m, i]) * slopes[m, j]
+        gradient[i] += by_course[i]
+        if len(hessian) > 0:
+            for j in range(i + 1):
+                hessian[i, j] += square[i, j]
+    whiten(course[1], gradient, hessian)
     for i in range(6):
-        for j in range(6):
-            for m in range(6):
-                hessian[i, j] += slopes[m, i] * half[m, j]
-    for o in range(6, len(hessian)):
-        for j in range(6):
-            for m in range(6):
-                hessian[o, j] += mixed[o, m] * slopes[m, j]
-            hessian[j, o] = hessian[o, j]
+        gradient[i] += x[i]
+        if len(hessian) > 0:
+            hessian[i, i] -= 1.0
+    return height
 
 
 @nb.njit(cache=True, error_model="numpy")
-def density_slopes(x, mean, tril, num, paper, cues, group, loc, std, height, gradient):  # type: ignore[no-untyped-def]
-    """Log density, height (S,), and its gradient (S, 6 + G) at whitened numbers x (S, 6 + G)."""
-    empty, z = np.empty((0, 0)), np.empty(x.shape[1])
+def density_slopes(x, course, num, paper, cues, group, loc, std, height, gradient):  # type: ignore[no-untyped-def]
+    """Log density of the factors, height (S,), and its gradient (S, 6 + G) at whitened numbers x (S, 6 + G)."""
+    empty, offset = np.empty((0, 0)), np.empty(len(loc))
     for i in range(len(x)):
-        for j in range(6):
-            z[j] = x[i, j]
         for g in range(len(loc)):
-            z[6 + g] = loc[g] + std[g] * x[i, 6 + g]
-        height[i] = linearise(z, mean, tril, num, paper, cues, group, gradient[i], empty)
+            offset[g] = loc[g] + std[g] * x[i, 6 + g]
+        height[i] = whitened_slopes(x[i, :6], offset, course, num, paper, cues, group, gradient[i], empty)
         for g in range(len(loc)):
             gradient[i, 6 + g] *= std[g]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def normal_equations(z, mean, tril, num, paper, cues, group, hessian, gradient):  # type: ignore[no-untyped-def]
-    """Minus the log density at z (6 + G,), its gradient (6 + G,) and its Gauss-Newton Hessian (6 + G, 6 + G)."""
-    cost = -linearise(z, mean, tril, num, paper, cues, group, gradient, hessian)
+def normal_equations(z, course, num, paper, cues, group, hessian, gradient):  # type: ignore[no-untyped-def]
+    """Minus the factors at z (6 + G,), whitened course and offsets [m], its gradient (6 + G,) and the lower half of its
+    Gauss-Newton Hessian (6 + G, 6 + G)."""
+    cost = -whitened_slopes(z[:6], z[6:], course, num, paper, cues, group, gradient, hessian)
     for j in range(len(z)):
         gradient[j] = -gradient[j]
     return cost
 
 
 @nb.njit(cache=True, error_model="numpy")
-def explain(z, mean, tril, num, paper, cues, group, out):  # type: ignore[no-untyped-def]
+def slopes_in_course(z, num, paper, cues, group, gradient):  # type: ignore[no-untyped-def]
+    """Log density of the cues at z (6 + G,), a course C and offsets [m], and its gradient (6 + G,)."""
+    theta, fit, empty = np.empty(6), np.empty((3, 6)), np.empty((0, 0))
+    hermite_one(z[0], z[1], z[2], z[3], z[4], z[5], theta)
+    if theta[LENGTH] == np.inf:
+        gradient[:] = 0.0
+        return (len(z) - 6) * NO_ROAD
+    height = linearise(theta, z[6:], num, paper, cues, group, gradient, empty)
+    hermite_slopes(z[:6], theta, fit)
+    shape = gradient[3:6].copy()
+    gradient[3:6] = 0.0  # the start of the clothoid is that of the course
+    for j in range(6):
+        for i in range(3):
+            gradient[j] += fit[i, j] * shape[i]
+    return height
+
+
+@nb.njit(cache=True, error_model="numpy")
+def explain(z, num, paper, cues, group, out):  # type: ignore[no-untyped-def]
     """Of every cue its lateral residual and its residual in direction, both in standard deviations, and the probability
-    that it follows the road; out (N, 3)."""
-    course, clothoid, table, rows = np.empty(6), np.empty(6), np.empty((num, COLUMNS)), np.empty((3, 6))
-    step = lay_course(z, mean, tril, course, clothoid, table)
+    that it follows the road, out (N, 3), at a course C and offsets [m], z (6 + G,)."""
+    theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((3, 6))
+    hermite_one(z[0], z[1], z[2], z[3], z[4], z[5], theta)
+    if theta[LENGTH] == np.inf:
+        out[:] = np.nan
+        return
+    step = sample_one(theta, table)
     for n in range(len(cues)):
-        if step == np.inf:
-            out[n, 0] = out[n, 1] = out[n, 2] = np.nan
-            continue
         k = nearest_sample(cues, n, table, step)
         out[n, 2] = score_cue(paper, cues, n, z[6 + group[n]], table, k, rows)[1]
         out[n, 0], out[n, 1] = rows[1 if paper else 0, 0], rows[2, 0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from inference import importance
-from inference.empirical_bayes import Learnt, ascend, draw, informations, learn, slope
+from inference.empirical_bayes import Learnt, ascend, draw, informations, learn, log_ratios, slope
 from inference.posterior import Posterior
+from inference.weights import effective_size
 from models.capability import Hyper
 from models.program import InputError, log_joint
 
@@ -152,8 +154,54 @@ def test_a_step_promises_what_it_gains() -> None:
     assert gain > 1.0 and abs(step.gain - gain) < 4 * step.error
 
 
-def test_an_engine_of_weighted_draws_learns_the_same(learnt: Learnt) -> None:
-    engine = lambda model, evidence, seed: importance.run(model, evidence, seed=seed, num_draws=100, num_rounds=2)  # noqa: E731
+def test_a_long_step_is_cut_until_the_draws_bear_it() -> None:
+    family, data, h = hyper(width=30.0), scenes(40), np.array([-1.0, -0.5, 0.7])
+    drawn = draw(family, data, exact, h, np.random.SeedSequence(5), 200)
+    step = ascend(family, drawn)
+    ratios = log_ratios(drawn, step.h)
+    assert np.mean([effective_size(row) / 200 for row in ratios]) >= 0.5
+    assert height(step.h, data, family) - height(h, data, family) > 10.0
+
+
+def test_a_narrow_prior_holds_the_settings_back() -> None:
+    family, data = hyper(width=0.15), scenes(40)
+    found = learn(family, data, exact, seed=4, progress=False)
+    best = minimize(lambda h: -height(h, data, family), TRUE, method="BFGS").x
+    assert np.all(np.abs(found.h - best) < 4 * found.noise)
+    free = minimize(lambda h: -height(h, data, hyper()), TRUE, method="BFGS").x
+    assert np.abs(found.h - free).max() > 20 * found.noise.max()
+
+
+def wide(model: Normals, evidence: Readings, *, seed: int) -> Posterior:
+    """Weighted draws from a normal about the posterior, beside it and twice as wide."""
+    y, rng = evidence.y.numpy(), np.random.default_rng(seed)
+    precision = 1 / model.omega**2 + len(y) / model.tau**2
+    x = rng.standard_normal((1, 800))
+    z = (model.mu / model.omega**2 + y.sum() / model.tau**2) / precision + (0.5 + 2 * x) / math.sqrt(precision)
+    return Posterior({"z": z}, 0.5 * x**2 - 0.5 * (0.5 + 2 * x) ** 2, model.evidence_of(y))
+
+
+def test_weighted_draws_teach_the_same_with_more_noise() -> None:
+    data, family = scenes(20), hyper()
+    found = learn(family, data, wide, seed=2, num_draws=800, progress=False)
+    best = minimize(lambda h: -height(h, data, family), TRUE, method="BFGS").x
+    assert np.all(np.abs(found.h - best) < 4 * found.noise)
+    drawn = draw(family, data, wide, found.h, np.random.SeedSequence(6), 800)
+    assert drawn.size == pytest.approx(np.full(20, worth_of_wide() * 800), rel=0.15)
+    sharp = learn(family, data, partial(exact, num=800), seed=2, num_draws=800, progress=False)
+    assert found.noise / sharp.noise == pytest.approx(np.full(3, worth_of_wide() ** -0.5), rel=0.25)
+
+
+def worth_of_wide() -> float:
+    """E[w]^2 / E[w^2] of the weights of `wide`."""
+    x = np.linspace(-9.0, 9.0, 4001)
+    w, p = np.exp(0.5 * x**2 - 0.5 * (0.5 + 2 * x) ** 2), np.exp(-0.5 * x**2)
+    p /= p.sum()
+    return float((w @ p) ** 2 / (w**2 @ p))
+
+
+def test_an_engine_of_this_house_learns_the_same() -> None:
+    engine = partial(importance.run, num_draws=100, num_rounds=2)
     data = scenes(12)
     found = learn(hyper(), data, engine, seed=2, num_draws=100, progress=False)
     best = minimize(lambda h: -height(h, data, hyper()), TRUE, method="BFGS").x

@@ -30,6 +30,7 @@ TRUE = {
     "delineator.right.mean": -4.2,
     "delineator.right.std": 0.5,
     "car.flow_std": 0.1,
+    "prior.curvature_std": 1 / 250,
 }
 
 
@@ -81,7 +82,8 @@ def test_numbers_and_settings_go_there_and_back() -> None:
     h = family.start + np.linspace(-0.5, 0.5, len(family.names))
     other = family.model(h)
     assert family.natural(h) == pytest.approx([setting(other, name).value for name in family.names])
-    assert model.extra_kinds[0] in other.extra_kinds and other.prior == model.prior  # nobody saw a sign
+    assert model.extra_kinds[0] in other.extra_kinds  # nobody saw a sign
+    assert other.prior.length == model.prior.length
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,13 @@ data-trained counterparts".
     KIND.std, KIND.flow_std                 how far single cues stray across the road and from its direction; log
     KIND.right.mean, KIND.right.std         prior of the offset on one side (`left`: oncoming traffic); plain and log
     beta_static, beta_vehicle, beta_flow    weights of the paper's likelihood, in place of clutter and strays; log
+    prior.curvature_std and others          of the course (`OF_COURSE`); log
 
 Only what some scene shows can be learnt. The density of a scene's draws z = (course, offset) under other settings is
 
-    log p(z, y | h) = sum_g log N(offset_g; mean_g, std_g^2) + sum_n log p(cue_n | course, offset, h) + const
+    log p(z, y | h) = log p(course | h) + sum_g log N(offset_g; mean_g, std_g^2) + sum_n log p(cue_n | z, h) + const
 
-where the sample of the course that is nearest to a cue does not depend on h and is found once. The prior of the course
-is not learnt.
+where the sample of the course that is nearest to a cue does not depend on h and is found once.
 
 What learning means for the paper's likelihood, which is no density of positions: it is taken as printed. Its position
 error holds the way along the road to the nearest sample too, up to half the spacing, so beta_static falls to about
@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.special import expit, logit
 
 from models.capability import Hyper
@@ -40,6 +41,7 @@ from models.program import InputError
 from models.road.along_road import cue_arrays
 from models.road.cue_kernel import nearest_sample, score_cue
 from models.road.cues import KINDS, CueKind, Cues
+from models.road.prior import course_moments
 
 if TYPE_CHECKING:
     from models.road.course import RoadCourse
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 SHARED = ("clutter", "beta_static", "beta_vehicle", "beta_flow")
+OF_COURSE = ("lateral_std", "heading_std", "curvature_std", "rate_std")  # of models.road.prior that all scenes teach
 FACTOR_WIDTH = 1.0  # of the hyper-prior of logarithms: two of three within a factor of e
 SHARE_WIDTH = 1.5  # of logits
 MEAN_WIDTH = 3.0  # of means of offsets, in their configured standard deviations
@@ -120,7 +123,7 @@ def learnable(model: RoadCourse, scenes: Sequence[Cues]) -> list[str]:
             names += [f"{kind.name}.flow_std"] if kind.moves and kind.name in flows else []
         for side, left in (("right", False), ("left", True)):
             names += [f"{kind.name}.{side}.{what}" for what in ("mean", "std") if (kind.name, left) in sides]
-    return names
+    return names + [f"prior.{what}" for what in OF_COURSE]
 
 
 def chosen(model: RoadCourse, scenes: Sequence[Cues], names: Sequence[str]) -> list[str]:
@@ -158,6 +161,8 @@ def setting(model: RoadCourse, name: str) -> Setting:
         value = float(getattr(model, name))
         return Setting(name, value, *(("logit", SHARE_WIDTH) if name == "clutter" else ("log", FACTOR_WIDTH)))
     kind, *rest = name.split(".")
+    if kind == "prior":
+        return Setting(name, float(getattr(model.prior, rest[0])), "log", FACTOR_WIDTH)
     known = known_kinds(model)[kind]
     if len(rest) == 1:
         return Setting(name, float(getattr(known, rest[0])), "log", FACTOR_WIDTH)
@@ -180,20 +185,23 @@ def changed(model: RoadCourse, values: dict[str, float]) -> RoadCourse:
             }
             flow_std = pick("flow_std", kind.flow_std)
             kinds.append(replace(kind, **sides, std=pick("std", kind.std), flow_std=flow_std))  # type: ignore[arg-type]
-    return replace(model, **{n: v for n, v in values.items() if n in SHARED}, extra_kinds=tuple(kinds))  # type: ignore[arg-type]
+    shared = {name: value for name, value in values.items() if name in SHARED}
+    of_course = {name: values[f"prior.{name}"] for name in OF_COURSE if f"prior.{name}" in values}
+    return replace(model, **shared, prior=replace(model.prior, **of_course), extra_kinds=tuple(kinds))  # type: ignore[arg-type]
 
 
 def scene_density(
     model: RoadCourse, names: tuple[str, ...], cues: Cues, draws: dict[str, Floats]
 ) -> Callable[[Floats], Floats]:
     """The function that takes settings (H,) to log p(z, y | settings) (n,) at draws of course (n, 6) and offset (n, G),
-    but for the prior of the course."""
+    but for a constant."""
     evidence = model.prepare(cues)
     seen = evidence.cues.numpy()  # type: ignore[union-attr]
     course, offset = (np.ascontiguousarray(draws[site]) for site in ("course", "offset"))
     where, paper = places(names, cues, evidence.group), model.likelihood == "paper"
     configured = np.array([setting(model, name).value for name in names])
     shared = [i for i, name in enumerate(names) if name in SHARED]
+    course_names = [i for i, name in enumerate(names) if name.startswith("prior.")]
     read = [i for i in np.unique([*shared, *where.std, *where.flow_std]).astype(int) if i >= 0]  # by the cues
     nearest = np.empty((len(course), len(seen), COLUMNS))
     near_samples(course, model.num_samples, cue_arrays(model, evidence, seen)[0], nearest)  # type: ignore[call-arg]
@@ -217,11 +225,19 @@ def scene_density(
         score_draws(paper, rows, group, offset, nearest, out)  # type: ignore[call-arg]
         return out
 
+    @lru_cache(maxsize=4)
+    def of_course(few: tuple[float, ...]) -> Floats:
+        own = {names[i].partition(".")[2]: value for i, value in zip(course_names, few, strict=True)}
+        mean, tril = course_moments(replace(model.prior, **own))
+        apart = solve_triangular(tril, (course - mean).T, lower=True)
+        return np.asarray(-0.5 * (apart**2).sum(0) - np.log(tril.diagonal()).sum())
+
     def density(values: Floats) -> Floats:
         loc = np.where(where.mean >= 0, values[where.mean], evidence.offset_loc)
         std = evidence.offset_std * factors(values)[where.offset_std]
         of_offsets = (-0.5 * ((offset - loc) / std) ** 2 - np.log(std)).sum(1)
-        return np.asarray(of_offsets + of_cues(tuple(values[read].tolist())))
+        first, second = (tuple(values[few].tolist()) for few in (course_names, read))
+        return np.asarray(of_course(first) + of_offsets + of_cues(second))
 
     return density
 

@@ -14,8 +14,10 @@ another one that tells the log evidence is named. What was learnt is stored as a
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -107,16 +109,24 @@ def plan(words: list[str]) -> Plan:
                 raise ConfigError("learn is empty; name settings, such as learn=[clutter,delineator], or leave it out")
         elif key.removeprefix("held_out.") == "scenario.seed":
             raise ConfigError(f"learning numbers its scenes itself; give scenes=N and held_out=N instead of {word}")
+        elif key.startswith("held_out.") and not key.startswith("held_out.scenario"):
+            raise ConfigError(f"{word} is no setting of a scenario; held-out scenes differ by held_out.scenario alone")
         else:
             values = list(override.sweep_string_iterator()) if override.is_sweep_override() else None
-            turns = [word] if values is None else [f"{word.partition('=')[0]}={value}" for value in values]
+            turns = [word] if values is None else [f"{_key(word)}={value}" for value in values]
             if key.startswith("held_out."):
                 held = [[*few, turn.removeprefix("held_out.")] for few in held for turn in turns]
             else:
                 rest = [[*few, turn] for few in rest for turn in turns]
-    shared = [word for word in rest[0] if all(word in few for few in rest)]
-    own = held if held != [[]] else [[w for w in few if w not in shared] for few in rest]
-    return Plan(numbers["scenes"], numbers["held_out"], names, rest, [[*shared, *few] for few in own])
+    other = {_key(word) for word in held[0]}
+    kept = dict.fromkeys(tuple(word for word in few if _key(word) not in other) for few in rest)
+    both = [[*few, *own] for few in kept for own in held]
+    return Plan(numbers["scenes"], numbers["held_out"], names, rest, both)
+
+
+def _key(word: str) -> str:
+    """'scenario.clutter=.1' -> 'scenario.clutter'."""
+    return word.partition("=")[0]
 
 
 def task_of(plan: Plan) -> Task:
@@ -161,12 +171,15 @@ def run(task: Task, say: Callable[[str], None] = print) -> None:
         check_reads(model, scene.data)
     say(f"scenes     {len(scenes)} to learn from, {len(others)} held out")
     family = hyper(model, [scene.data for scene in scenes], task.names)
-    seed = engine_seed(task.config["seed"])
+    seed, began = engine_seed(task.config["seed"]), time.perf_counter()
     learnt = empirical_bayes.learn(family, [scene.data for scene in scenes], engine, seed=seed)
+    seconds = time.perf_counter() - began
+    say(f"learnt     {len(family.names)} settings in {len(learnt.path) - 1} rounds, {seconds:.0f} s")
     after = family.model(learnt.h)
     held = judge(others, (model, after), engine, metrics, seed)
-    say(f"learnt     {len(family.names)} settings in {len(learnt.path) - 1} rounds")
-    write(task, table_of(family, learnt), held, learnt, difference(model, after))
+    info = {"scenes": [scene.name for scene in scenes], "held_out": [scene.name for scene in others]}
+    manifest = store.manifest(task.folder.name, task.config, {"run": task.config["seed"]}, {"learning": seconds}, info)
+    write(task, table_of(family, learnt), held, learnt, difference(model, after), manifest)
 
 
 def judge(scenes: Sequence[Scene], models: tuple[Any, Any], engine: Any, metrics: Sequence[Any], seed: int) -> Held:
@@ -231,7 +244,9 @@ def experiment_of(task: Task, changes: dict[str, Any]) -> str:
     return f"# @package _global_\n# Learnt by {task.folder.name}.\n{yaml.safe_dump(content, sort_keys=False)}"
 
 
-def write(task: Task, rows: list[Row], held: Held, learnt: Learnt, changes: dict[str, Any]) -> None:
+def write(
+    task: Task, rows: list[Row], held: Held, learnt: Learnt, changes: dict[str, Any], manifest: dict[str, Any]
+) -> None:
     """learnt.csv, held_out.json, conf/experiment/<name>.yaml, figures/settings.png, manifest.json and report.html."""
     from experiments.report import details, page, save_figures, table
 
@@ -243,15 +258,14 @@ def write(task: Task, rows: list[Row], held: Held, learnt: Learnt, changes: dict
         outcome = {"gain": held.gain, "scores": held.scores, "flags": learnt.flags}
         store.write_json(folder / "held_out.json", outcome | {"log_evidence": learnt.log_evidence.sum(1)})
         images, failures = save_figures(folder, {"settings": figure(rows, learnt)})
-        manifest = store.manifest(task.folder.name, task.config, {"run": task.config["seed"]}, {}, {})
         body = [
             f"<h1>{task.folder.name}</h1><p class='sub'>{len(task.scenes)} scenes, {len(task.held_out)} held out</p>",
-            *(f'<p class="flag">{flag}</p>' for flag in learnt.flags),
+            *(f'<p class="flag">{escape(flag)}</p>' for flag in learnt.flags),
             table(("setting", "configured", "learnt", "standard error", "Monte Carlo error"), rows),
             f"<h2>Held-out scenes</h2><p>{sentence(held)}</p>",
             table(("score", "configured", "learnt"), [(name, *both) for name, both in held.scores.items()]),
             *images.values(),
-            f"<h2>To use them</h2><pre>{usage(task)}</pre>",
+            f"<h2>To use them</h2><pre>{escape(usage(task))}</pre>",
             details("experiment", changes),
             details("manifest", manifest),
         ]

@@ -61,6 +61,7 @@ def test_what_was_learnt_runs_as_an_experiment(
         (["learn=bicycle"], "'bicycle' cannot be learnt: no scene has a bicycle"),
         (["scenario.seed=3"], "learning numbers its scenes itself"),
         (["held_out.scenario.seed=3"], "learning numbers its scenes itself"),
+        (["held_out.model.clutter=.1"], "held-out scenes differ by held_out.scenario alone"),
         (["held_out.scenario.cluter=.1"], "scenario has no knob 'cluter'; did you mean 'clutter'?"),
         (["engine=rjmcm"], "there is no engine called 'rjmcm'; did you mean 'rjmcmc'?"),
         (["engine=bbvi_pap"], "there is no engine called 'bbvi_pap'"),
@@ -96,8 +97,15 @@ def test_values_after_commas_take_turns_and_held_out_words_count_there_only() ->
 
 
 def test_held_out_scenes_are_like_the_others_unless_told() -> None:
-    found = plan(["scenario.clutter=0,.1"])
-    assert [sorted(words) for words in found.held_words] == [sorted(words) for words in found.words]
+    words = ["scenario.clutter=0,0.1", "scenario.yaw=0.01"]
+    found = plan(words)
+    assert found.held_words == found.words and len(found.words) == 2
+    found = plan([*words, "held_out.scenario.yaw=0.02,0.03"])
+    assert [sorted(w[-2:]) for w in found.held_words] == [
+        [f"scenario.clutter={c}", f"scenario.yaw={y}"] for c in ("0", "0.1") for y in ("0.02", "0.03")
+    ]
+    found = plan([*words, "held_out.scenario.clutter=0.3"])
+    assert found.held_words == [["engine=importance", "scenario.yaw=0.01", "scenario.clutter=0.3"]]
 
 
 def test_only_what_was_learnt_is_written() -> None:

@@ -14,10 +14,11 @@ Only what some scene shows can be learnt. The density of a scene's draws z = (co
 where the sample of the course that is nearest to a cue does not depend on h and is found once.
 
 What learning means for the paper's likelihood, which is no density of positions: it is taken as printed. Its position
-error holds the way along the road to the nearest sample too, up to half the spacing, so beta_static falls to about
-std^2 / (std^2 + spacing^2 / 12): it learns how coarse the samples are. Its flow error 1 - cos is about angle^2 / 2. As
-a density of the angle its normaliser goes with beta^(1/4), not with the printed beta^(1/2), so beta_flow comes out
-twice as large as that of a density. Only sigma^2 / beta matters, so the kinds' std stay as they are.
+error holds what sigma leaves out, the measured covariance and the way along the road to the nearest sample, up to half
+the spacing, so beta_static falls below std^2 / (std^2 + spacing^2 / 12): it learns how coarse the samples are. Its flow
+error 1 - cos is about angle^2 / 2. As a density of the angle its normaliser goes with beta^(1/4), not with the printed
+beta^(1/2), so beta_flow comes out twice as large as that of a density. Only sigma^2 / beta matters, so the kinds' std
+stay as they are. Its evidence compares settings of this likelihood with each other, not with those of `exact`.
 """
 
 from __future__ import annotations

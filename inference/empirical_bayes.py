@@ -41,6 +41,7 @@ Array = NDArray[np.float64]
 Engine = Callable[..., Posterior]  # (model, evidence, *, seed)
 TRUST = 0.5  # longest step in one number, in widths of the prior
 ENOUGH = 0.5  # of the draws must stay effective, on average over the scenes
+LEFT = 1e-6  # of the promise of a step, that the search for it may leave
 SURE = 2.0  # Monte Carlo errors that a step must promise
 DIFFERENCE = 1e-4  # step of first differences, in widths of the prior
 BEND = 1e-3  # of second ones
@@ -202,7 +203,7 @@ def ascend(hyper: Hyper, drawn: Drawn) -> Step:
     size = len(drawn.h)
     found = minimize(
         lambda step: -promise(step)[0], np.zeros(size), method="L-BFGS-B", bounds=[(-TRUST, TRUST)] * size,
-        options={"eps": 1e-6},
+        options={"eps": 1e-6, "ftol": LEFT},
     )  # fmt: skip
     step = found.x
     while True:

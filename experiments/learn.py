@@ -6,6 +6,7 @@
 Every setting of `waybayes` works here too. The scenes are seeds 0, 1, .. of the scenario, those held out the seeds that
 follow; values after commas take turns. A word that begins with `held_out.` counts for held-out scenes only. Without
 learn=[..] all settings are learnt that the scenes say something about; `delineator` stands for all of that kind.
+num_draws=N and num_rounds=N are those of the method.
 
 The method is inference.empirical_bayes, the settings are those of models.road.hyper. The engine is importance unless
 another one that tells the log evidence is named. What was learnt is stored as an experiment that `waybayes` takes.
@@ -49,6 +50,7 @@ class Plan(NamedTuple):
     names             settings, none for all
     words             settings of `waybayes`, one list for each combination of values that take turns
     held_words        the same of the held-out scenes
+    knobs             of inference.empirical_bayes.learn
     """
 
     scenes: int
@@ -56,6 +58,7 @@ class Plan(NamedTuple):
     names: list[str]
     words: list[list[str]]
     held_words: list[list[str]]
+    knobs: dict[str, int]
 
 
 class Task(NamedTuple):
@@ -64,6 +67,7 @@ class Task(NamedTuple):
     scenes: list[dict[str, Any]]
     held_out: list[dict[str, Any]]
     names: list[str]
+    knobs: dict[str, int]
     config: dict[str, Any]
     choices: dict[str, str]
     folder: Path
@@ -93,14 +97,16 @@ class Held(NamedTuple):
 
 def plan(words: list[str]) -> Plan:
     """Read the command line. Raises ConfigError for words that say nothing."""
-    numbers, names, rest, held = {"scenes": 60, "held_out": 30}, [], [["engine=importance"]], [list[str]()]
+    numbers, names = {"scenes": 60, "held_out": 30, "num_draws": 200, "num_rounds": 15}, list[str]()
+    rest, held = [["engine=importance"]], [list[str]()]
     for word in words:
         override = OverridesParser.create().parse_override(word)
         key = override.key_or_group
         if key in numbers:
             value = override.value()
-            if isinstance(value, bool) or not isinstance(value, int) or value < LEAST:
-                raise ConfigError(f"{key} is '{value}'; give a number of scenes, {LEAST} or more")
+            least = 1 if key == "num_rounds" else LEAST
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ConfigError(f"{key} is '{value}'; give a whole number, {least} or more")
             numbers[key] = value
         elif key == "learn":
             value = override.value()
@@ -121,7 +127,8 @@ def plan(words: list[str]) -> Plan:
     other = {_key(word) for word in held[0]}
     kept = dict.fromkeys(tuple(word for word in few if _key(word) not in other) for few in rest)
     both = [[*few, *own] for few in kept for own in held]
-    return Plan(numbers["scenes"], numbers["held_out"], names, rest, both)
+    scenes, held_out = numbers.pop("scenes"), numbers.pop("held_out")
+    return Plan(scenes, held_out, names, rest, both, numbers)
 
 
 def _key(word: str) -> str:
@@ -147,10 +154,10 @@ def task_of(plan: Plan) -> Task:
     first = -(-plan.scenes // len(turns))
     others = [{**held[i % len(held)].config["scenario"], "seed": first + i // len(held)} for i in range(plan.held_out)]
     config = {key: value for key, value in turns[0].config.items() if key not in ("figures", "functionals")}
-    whole = config | {"scenario": [*scenes, *others], "scenes": plan.scenes, "learn": plan.names}
+    whole = config | {"scenario": [*scenes, *others], "scenes": plan.scenes, "learn": plan.names} | plan.knobs
     title = "-".join(str(choices[part]) for part in ("scenario", "model", "engine"))
     folder = turns[0].folder.parent / f"learn-{title}-{store.identity(whole)}"
-    return Task(scenes, others, plan.names, config, choices, folder, force or turns[0].force)
+    return Task(scenes, others, plan.names, plan.knobs, config, choices, folder, force or turns[0].force)
 
 
 def run(task: Task, say: Callable[[str], None] = print) -> None:
@@ -170,9 +177,12 @@ def run(task: Task, say: Callable[[str], None] = print) -> None:
     for scene in scenes[:1]:
         check_reads(model, scene.data)
     say(f"scenes     {len(scenes)} to learn from, {len(others)} held out")
-    family = hyper(model, [scene.data for scene in scenes], task.names)
+    data, knobs = [scene.data for scene in scenes], task.knobs
+    family = hyper(model, data, task.names)
     seed, began = engine_seed(task.config["seed"]), time.perf_counter()
-    learnt = empirical_bayes.learn(family, [scene.data for scene in scenes], engine, seed=seed)
+    learnt = empirical_bayes.learn(
+        family, data, engine, seed=seed, num_draws=knobs["num_draws"], num_rounds=knobs["num_rounds"]
+    )
     seconds = time.perf_counter() - began
     say(f"learnt     {len(family.names)} settings in {len(learnt.path) - 1} rounds, {seconds:.0f} s")
     after = family.model(learnt.h)

@@ -24,7 +24,7 @@ def test_what_was_learnt_runs_as_an_experiment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    words = [*WORDS, "engine.num_draws=100", "engine.num_rounds=3"]
+    words = [*WORDS, "engine.num_draws=100", "engine.num_rounds=3", "num_draws=50"]
     learn(words)
     said = capsys.readouterr().out
     (folder,) = Path("runs").glob("learn-night_road-road_course-importance-*")
@@ -54,8 +54,9 @@ def test_what_was_learnt_runs_as_an_experiment(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["scenes=1"], "scenes is '1'; give a number of scenes, 2 or more"),
-        (["held_out=none"], "held_out is 'none'; give a number of scenes"),
+        (["scenes=1"], "scenes is '1'; give a whole number, 2 or more"),
+        (["held_out=none"], "held_out is 'none'; give a whole number"),
+        (["num_draws=5"], "num_draws is 5; learning needs 20 or more"),
         (["learn=[]"], "learn is empty"),
         (["learn=[delineatr.std]"], "did you mean 'delineator.std'?"),
         (["learn=bicycle"], "'bicycle' cannot be learnt: no scene has a bicycle"),

@@ -91,7 +91,7 @@ def taught() -> tuple[Hyper, Learnt]:
     truth = changed(RoadCourse(), TRUE)
     scenes = [simulated(truth, seed) for seed in range(60)]
     family = hyper(RoadCourse(), scenes, list(TRUE))
-    return family, learn(family, scenes, ENGINE, seed=0, num_draws=100, progress=False)
+    return family, learn(family, scenes, ENGINE, seed=0, num_draws=60, progress=False)
 
 
 def test_settings_that_made_the_roads_are_learnt_from_them(taught: tuple[Hyper, Learnt]) -> None:
@@ -111,12 +111,13 @@ def test_settings_that_made_the_roads_are_learnt_from_them(taught: tuple[Hyper, 
 
 def test_held_out_roads_are_more_probable_than_under_the_defaults(taught: tuple[Hyper, Learnt]) -> None:
     family, learnt = taught
-    scenes = [simulated(changed(RoadCourse(), TRUE), 1000 + seed) for seed in range(30)]
+    scenes = [simulated(changed(RoadCourse(), TRUE), 1000 + seed) for seed in range(80)]
     evidence = [
         draw(family, scenes, ENGINE, h, np.random.SeedSequence(5), 50).log_evidence for h in (family.start, learnt.h)
     ]
     gap = evidence[1] - evidence[0]
-    assert gap.mean() > 3 * gap.std(ddof=1) / np.sqrt(len(gap)) > 0
+    error = gap.std(ddof=1) / np.sqrt(len(gap))
+    assert gap.mean() > 3 * error, (gap.mean(), error)  # 30 scenes would leave 1.3 +- .4 nats
 
 
 def test_the_paper_s_beta_learns_how_coarse_the_samples_are() -> None:

@@ -251,3 +251,24 @@ class HasFactors(Protocol):
     def __call__(self, evidence: Any) -> None: ...
 
     def factors(self, evidence: Any) -> Factors: ...
+
+
+class Hyper(NamedTuple):
+    """Some settings of a model as unconstrained numbers h (H,), to be learnt from scenes (inference.empirical_bayes).
+
+        log p(h) = sum_i log N(h_i; start_i, width_i^2)     weak: it decides only what no scene says anything about
+
+    names     (H,) of the settings
+    start     (H,) as configured
+    width     (H,) of the prior
+    natural   h -> (H,) the settings as people write them
+    model     h -> the program that has them
+    complete  (data, {site: (n, *event)}) -> a function h -> log p(z, y | h) (n,), but for what h does not change
+    """
+
+    names: tuple[str, ...]
+    start: np.ndarray
+    width: np.ndarray
+    natural: Callable[[np.ndarray], np.ndarray]
+    model: Callable[[np.ndarray], Any]
+    complete: Callable[[Any, dict[str, np.ndarray]], Callable[[np.ndarray], np.ndarray]]

@@ -240,12 +240,16 @@ def _draw(move: Callable[[Any], State], frame: Any, num: int, rng: np.random.Gen
     import pyro
 
     found = list[State]()
+
+    def keep(frame: Any) -> None:
+        found.append(move(frame))
+
     with quiet_doubles(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**63)))
-        plates = num_plate_dims(sample_sites(move, frame))
+        plates = num_plate_dims(sample_sites(keep, frame))
         with pyro.plate("_particles", num, dim=-1 - plates):
-            sites = sample_sites(lambda frame: found.append(move(frame)), frame)
-    return found[0], _log_density(sites, plates, num)
+            sites = sample_sites(keep, frame)
+    return found[-1], _log_density(sites, plates, num)
 
 
 def _seen(model: HasSteps, state: State, frame: Any, num: int) -> Array:

@@ -110,8 +110,9 @@ class LinearWalk:
             back = P @ F.T @ np.linalg.inv(predicted[t + 1][1])
             m = m + back @ (next_mean - predicted[t + 1][0])
             smoothed.insert(0, (m, P + back @ (next_P - predicted[t + 1][1]) @ back.T))
-        parts = [np.stack(column) for pairs in (filtered, smoothed) for column in zip(*pairs, strict=True)]
-        return Smoothed(*parts, log_evidence)
+        (means, covariances), (late_means, late_covariances) = zip(*filtered, strict=True), zip(*smoothed, strict=True)
+        parts = [np.stack(column) for column in (means, covariances, late_means, late_covariances)]
+        return Smoothed(parts[0], parts[1], parts[2], parts[3], log_evidence)
 
     def _step(self, frame: Fix) -> tuple[Floats, Floats]:
         """F and Q."""

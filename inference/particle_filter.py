@@ -5,14 +5,14 @@ N particles with weights W (summing to one) stand for p(z_(t-1) | y_0, ..., y_(t
 bootstrap   resample where 1 / sum W^2 < ess N, move by the model, and weigh:
                 z ~ p(z_t | z_(t-1)),   w = p(y_t | z),   p(y_t | past) ~ sum W w,   W <- W w / sum W w
 
-guided      in few steps only particles survive that were led to where the frame is. With L(z) a Gaussian guide of
-            p(y_t | z) (inference.guide) and m_n = int p(z | particle n) L(z) dz, m = sum W_n m_n, draw particle and
-            move together from
+guided      in many dimensions only particles survive that were led to where the frame is. With L(z) = sum_k L_k(z),
+            Gaussian guides about the modes of the frame (inference.guide), m_kn = int p(z | particle n) L_k(z) dz and
+            m = sum W_n m_kn, draw particle and move together from
                 q(n, z) = W_n p(z | particle n) r(z),   r(z) = (1 - d) L(z) / m + d
-            by systematic resampling of the 2 N parts, and weigh with what the guide got wrong:
+            by systematic resampling of the parts, guides and none by particles, and weigh with what L got wrong:
                 w = p(y_t | z) / r(z),   p(y_t | past) ~ mean w,   W <- w / sum w
             It is the auxiliary particle filter (Pitt and Shephard 1999), fully adapted to L. The share d of unguided
-            moves bounds the weights: p(y_t | z) / d, whatever the guide missed.
+            moves bounds the weights: p(y_t | z) / d, whatever the guides missed.
 
 Both estimates of p(y), the product over frames, are unbiased. Their error is read from families, the shares s_i of the
 last particles' weight that descend from each first particle: log p(y) has the standard error sqrt(sum s_i^2 - 1 / N),
@@ -112,19 +112,21 @@ def guided_step(
     old = np.zeros(1) if cloud is None else cloud.log_weights
     before = np.zeros(1) if cloud is None else cloud.height
     step = model.gaussian_step(None if cloud is None else cloud.state, frame)
-    guide = fit(step, old, rng)
-    ahead = look_ahead(guide, step)
-    log_mass = weights.log_mean(old + ahead.log_mass) + math.log(len(old))  # log m
+    guides = fit(step, old, rng)
+    aheads = [look_ahead(guide, step) for guide in guides]
+    mass = np.stack([old + ahead.log_mass for ahead in aheads])  # (K, N)
     with np.errstate(divide="ignore"):
-        log_guided, log_free = math.log1p(-defence), np.log(defence)
-    parts = np.concatenate([old + ahead.log_mass - log_mass + log_guided, old + log_free])
-    part = weights.systematic(parts, num, rng.random())
-    parent, is_guided = part % len(old), part < len(old)
+        log_guided, log_free = math.log1p(-defence) - weights.log_sum(mass), np.log(defence)
+    part = weights.systematic(np.concatenate([*(mass + log_guided), old + log_free]), num, rng.random())
+    kind, parent = np.divmod(part, len(old))
     noise = rng.standard_normal((num, len(step.tril)))
-    u = np.where(is_guided[:, None], ahead.centre[parent] + noise @ ahead.tril.T, noise)
+    u = noise.copy()
+    for k, ahead in enumerate(aheads):
+        u[kind == k] = ahead.centre[parent[kind == k]] + noise[kind == k] @ ahead.tril.T
     z = step.mean[parent] + u @ step.tril.T
     log_seen = step.density(z)
-    log_weights = log_seen - np.logaddexp(log_guided + guide.log_density(z) - log_mass, log_free)
+    log_guides = np.logaddexp.reduce([guide.log_density(z) for guide in guides])
+    log_weights = log_seen - np.logaddexp(log_guided + log_guides, log_free)
     log_factor = weights.log_mean(log_weights)
     moving = step.tril.diagonal()[step.tril.diagonal() > 0.0]
     const = 0.5 * len(moving) * math.log(2.0 * math.pi) + np.log(moving).sum()

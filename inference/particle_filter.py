@@ -179,7 +179,7 @@ def run(
     shares = np.bincount(families, np.exp(clouds[-1].log_weights))
     worth = [cloud.ess for cloud in clouds]
     parents = [cloud.num_parents for cloud in clouds]
-    draws = [_choose(c.state, weights.systematic(c.log_weights, num_particles, rng.random())) for c in clouds]
+    draws = [_even(cloud, rng) for cloud in clouds]
     tops = [{n: v[cloud.best].numpy() for n, v in cloud.state.items()} for cloud in clouds]
     return Posterior(
         draws={n: np.stack([d[n].numpy() for d in draws], 1)[None] for n in draws[0]},
@@ -235,6 +235,12 @@ def _choose(state: State, index: Ints) -> State:
     """Particles index (N,) of a state."""
     rows = torch.from_numpy(index)
     return {name: value[rows] for name, value in state.items()}
+
+
+def _even(cloud: Cloud, rng: np.random.Generator) -> State:
+    """As many draws of equal weight, in no order: that of resampling puts the children of a particle side by side."""
+    index = weights.systematic(cloud.log_weights, len(cloud.log_weights), rng.random())
+    return _choose(cloud.state, rng.permutation(index))
 
 
 def _draw(move: Callable[[Any], State], frame: Any, num: int, rng: np.random.Generator) -> tuple[State, Array]:

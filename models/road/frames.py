@@ -1,7 +1,7 @@
 """The course of a road over the frames of a drive: a clothoid that is carried along while the road unrolls.
 
-State of a frame: the clothoid (y, heading, curvature k, rate r) at x = -behind in the car's present frame, and the
-offsets o of the groups of cues.
+State of a frame: `road`, the clothoid (y, heading, curvature k, rate r) at x = -behind in the car's present frame, and
+`offset`, o of the groups of cues; `course` is road once more in the numbers of models.road.course.
 
     first      the prior of models.road.prior at the start of the clothoid, and those of the offsets
     carried    by the car's motion T from frame to frame: the point of the clothoid where T (clothoid) has x = -behind
@@ -71,10 +71,10 @@ class RoadFrames:
     course: RoadCourse = USUAL_COURSE
     drift: Drift = USUAL_DRIFT
     piece: float = 300.0  # of road with one rate of curvature, about [m]
-    row: float = 500.0  # over which a row of static cues keeps its offset [m]
-    keeping: float = 5.0  # for which a vehicle keeps its place in the lane [s]
+    row: float = 2000.0  # over which a row of static cues keeps its offset [m]
+    keeping: float = 30.0  # for which a vehicle keeps its place in the lane [s]
     slip: float = 0.01  # of the road aside from its clothoid [m / sqrt(m)]
-    slip_heading: float = 3e-4  # [rad / sqrt(m)]
+    slip_heading: float = 1e-3  # [rad / sqrt(m)]
 
     def __post_init__(self) -> None:
         for field in fields(self)[2:]:
@@ -117,7 +117,7 @@ class RoadFrames:
             return float(height[0]), slope[0], information[0]
 
         def unpack(z: Floats) -> State:
-            return {"road": torch.from_numpy(z[:, :ROAD].copy()), "offset": torch.from_numpy(z[:, ROAD:].copy())}
+            return self._state(torch.from_numpy(z[:, :ROAD].copy()), torch.from_numpy(z[:, ROAD:].copy()))
 
         tril = block_diag(road_tril, np.diag(std))
         return GaussianStep(np.atleast_2d(mean.numpy()), tril, density, slopes, unpack)
@@ -140,7 +140,14 @@ class RoadFrames:
         mean, road_tril, std = moved
         road = pyro.sample("road", dist.MultivariateNormal(mean[..., :ROAD], scale_tril=torch.from_numpy(road_tril)))
         offset = pyro.sample("offset", dist.Normal(mean[..., ROAD:], torch.from_numpy(std)).to_event(1))
-        return {"road": road, "offset": offset}
+        return self._state(road, offset)
+
+    def _state(self, road: Tensor, offset: Tensor) -> State:
+        """The state with its `course` (*B, 6), C = (x, y, heading) of start and end as RoadCourse has it."""
+        clothoid = self.clothoid(road)
+        arc = torch.stack([torch.zeros_like(clothoid.length), clothoid.length], -1)
+        course = torch.stack(evaluate(clothoid, arc)[:3], -1).flatten(-2)
+        return {"road": road, "offset": offset, "course": course}
 
     def _first(self, frame: RoadFrame) -> Moved:
         prior, evidence = self.course.prior, frame.evidence

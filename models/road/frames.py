@@ -7,7 +7,7 @@ State of a frame: `road`, the clothoid (y, heading, curvature k, rate r) at x = 
     carried    by the car's motion T from frame to frame: the point of the clothoid where T (clothoid) has x = -behind
                    y, heading <- those there, + N(0, J P J' + ds diag(slip)^2)
                P the drift of the inertial unit over the frame (models.road.ego), J the slope of (y, heading) in it,
-               slip what a clothoid leaves out
+               slip what a clothoid leaves out, and in heading what a bias of the unit that lasts adds
     unrolled   roads are pieces of clothoids; one of mean length `piece` ends, and another rate begins, anywhere. The
                first two moments of that are those of
                    dk = r ds,   dr = -(k / length^2 + r / piece) ds + rate_std sqrt(2 / piece) dW

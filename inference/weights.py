@@ -30,10 +30,15 @@ def systematic(log_weights: Array, num: int, uniform: float) -> NDArray[np.int64
     return np.searchsorted(ladder, (np.arange(num) + uniform) / num, side="right").clip(max=ladder.size - 1)
 
 
+def log_sum(log_weights: Array) -> float:
+    """log of the sum of the weights, over all entries."""
+    top = np.max(log_weights)
+    return float(top + np.log(np.exp(log_weights - top).sum()))
+
+
 def log_mean(log_weights: Array) -> float:
     """log of the mean weight: log evidence where weights are p(x, y) / q(x)."""
-    top = np.max(log_weights)
-    return float(top + np.log(np.mean(np.exp(log_weights - top))))
+    return log_sum(log_weights) - float(np.log(log_weights.size))
 
 
 def relative_error(log_weights: Array) -> float:

@@ -6,6 +6,10 @@
     squares(evidence)  a compiled sum of squares of normal latents, for least squares without tracing the program
     factors(evidence)  the whitened density factor by factor in machine code, for engines that evaluate batches
     dimension          name of the site that counts the active slots
+    initial, transition, observe
+                       a sequential model frame by frame, for the particle filter (models.unroll makes it one program)
+    gaussian_step(state, frame)
+                       the same where a state moves by Gaussian steps, for proposals that look at the frame
 
 A move is an involution on (state, auxiliary numbers): (z, u) -> (z', u') and back, with u uniform
 on the unit cube. Choices are recycled: u = (k + r) / n picks k of n and keeps r. Then one number,
@@ -272,3 +276,50 @@ class Hyper(NamedTuple):
     natural: Callable[[np.ndarray], np.ndarray]
     model: Callable[[np.ndarray], Any]
     complete: Callable[[Any, dict[str, np.ndarray]], Callable[[np.ndarray], np.ndarray]]
+
+
+State = Latents  # of a sequential model: name -> (*batch, *event)
+
+
+@runtime_checkable
+class HasSteps(Protocol):
+    """A sequential model: a state that moves from frame to frame and is seen in each.
+
+        p(z, y) = p(z_0) prod_t p(z_t | z_(t-1)) prod_t p(y_t | z_t)
+
+    Each part is a program fragment, batched over leading dimensions. `initial` and `transition` sample sites and return
+    the state, by the names that reports show; `observe` has the observed sites, and no latent ones. A frame is a
+    NamedTuple whose fields are named as the sites they observe; None simulates. What a step needs to know of the world
+    between two frames (how long, how far) is in the later frame."""
+
+    def initial(self, frame: Any) -> State: ...
+
+    def transition(self, state: State, frame: Any) -> State: ...
+
+    def observe(self, state: State, frame: Any) -> None: ...
+
+
+class GaussianStep(NamedTuple):
+    """How N states come to a frame, and what it says of a state, in packed numbers z (D,).
+
+        z | previous state n ~ N(mean_n, tril tril^T),   -d2 log p(y | z) / dz2 ~ information
+
+    mean     (N, D); (1, D) at the first frame
+    tril     (D, D) the same for all, and singular where numbers stand still
+    density  z (S, D) -> log p(y | z) (S,)
+    slopes   z (D,) -> log p(y | z), its gradient (D,), information (D, D), positive semidefinite (Gauss-Newton's)
+    state    z (S, D) -> the state (S, *event)
+    """
+
+    mean: np.ndarray
+    tril: np.ndarray
+    density: Callable[[np.ndarray], np.ndarray]
+    slopes: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]]
+    state: Callable[[np.ndarray], State]
+
+
+@runtime_checkable
+class HasGaussianSteps(Protocol):
+    """A sequential model whose state moves by Gaussian steps; the first has no previous state (None)."""
+
+    def gaussian_step(self, state: State | None, frame: Any) -> GaussianStep: ...

@@ -14,8 +14,8 @@ import numpy as np
 from models.intersection.wrap import wrap
 
 X, Y, HEADING, CURVATURE, RATE, LENGTH = range(6)  # numbers of a clothoid, ordered as models.clothoid.Clothoid
-COS, SIN, BEND = 3, 4, 5  # columns of a table after x, y and heading; the last is the curvature
-COLUMNS = 6
+COS, SIN, BEND, ARC = 3, 4, 5, 6  # columns of a table after x, y and heading; then curvature and arc length
+COLUMNS = 7
 
 MAX_STRETCH = 8.0  # length over chord beyond which ends are refused: they point away from each other
 MIN_CHORD = 1e-6  # [m]: nearer ends have no direction
@@ -70,8 +70,8 @@ def hermite_one(x0, y0, heading0, x1, y1, heading1, out):  # type: ignore[no-unt
 
 @nb.njit(error_model="numpy")
 def sample_one(clothoid, table):  # type: ignore[no-untyped-def]
-    """Samples at equal steps of arc length, both ends included, into table (num, 6): x, y, heading, its cosine and
-    sine, curvature. clothoid (6,) as hermite_one fills it, of finite length; returns the step [m].
+    """Samples at equal steps of arc length, both ends included, into table (num, 7): x, y, heading, its cosine and
+    sine, curvature, arc length. clothoid (6,) as hermite_one fills it, of finite length; returns the step [m].
 
     From half step to half step the direction is rotated by a turn that is itself rotated by rate step^2 / 4: much
     cheaper than cosines. Every ANCHOR samples it is computed anew, before rounding adds up."""
@@ -87,7 +87,7 @@ def sample_one(clothoid, table):  # type: ignore[no-untyped-def]
             turn = half * (bend + 0.5 * rate * half)
             cos, sin, turn_cos, turn_sin = math.cos(heading), math.sin(heading), math.cos(turn), math.sin(turn)
         table[k, X], table[k, Y], table[k, HEADING] = x, y, heading
-        table[k, COS], table[k, SIN], table[k, BEND] = cos, sin, bend
+        table[k, COS], table[k, SIN], table[k, BEND], table[k, ARC] = cos, sin, bend, s
         sum_cos, sum_sin = cos, sin
         for weight in (4.0, 1.0):
             cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin

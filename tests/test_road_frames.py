@@ -48,11 +48,12 @@ def test_density_is_that_of_the_cues_about_the_nearest_samples(model: RoadFrames
     *_, paper, rows, group = model.arguments(evidence, cues.numpy())
     for i in range(5):
         x, y, heading, curvature = (column[i].numpy() for column in points)
-        table = np.stack([x, y, heading, np.cos(heading), np.sin(heading), curvature], -1)
+        arc = np.linspace(0.0, model.course.prior.length, len(x))
+        table = np.stack([x, y, heading, np.cos(heading), np.sin(heading), curvature, arc], -1)
         total = 0.0
         for n in range(len(rows)):
             k = int(np.hypot(x - rows[n, 0], y - rows[n, 1]).argmin())
-            total += score_cue(paper, rows, n, float(offset[i, group[n]]), table, k, np.empty((0, 6)))[0]
+            total += score_cue(paper, rows, n, float(offset[i, group[n]]), table, k, np.empty((0, 7)))[0]
         assert float(found[i]) == pytest.approx(total, rel=1e-7)
 
 

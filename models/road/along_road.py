@@ -113,6 +113,7 @@ def cue_arrays(model: RoadCourse, evidence: RoadEvidence, cues: Floats) -> tuple
     if not paper and model.clutter > 0:
         rows[:, 9] += math.log1p(-model.clutter)
         rows[:, 10] = model.clutter / model.clutter_width / np.where(measured, 2 * math.pi, 1.0)
+    rows[:, 11], rows[:, 12] = math.inf if paper else model.prior.behind + model.reach, model.reach_std**2
     return rows, evidence.group
 
 

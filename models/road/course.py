@@ -55,6 +55,8 @@ class RoadCourse:
     likelihood: Literal["exact", "paper"] = "exact"
     clutter: float = 0.05  # share of cues that do not follow the road; of `exact`
     clutter_width: float = 30.0  # across the road, where clutter is [m]
+    reach: float = 125.0  # of the camera along the road: half the cues there are seen; inf for no end [m]; of `exact`
+    reach_std: float = 14.0  # over which it ends [m]
     beta_static: float = 1.0  # weights of the paper's likelihood
     beta_vehicle: float = 1.0
     beta_flow: float = 1.0
@@ -67,7 +69,9 @@ class RoadCourse:
             raise InputError(f"likelihood is '{self.likelihood}'; choose 'exact' or 'paper'")
         if not 0 <= self.clutter < 1:
             raise InputError(f"clutter is {self.clutter}; give a share in [0, 1)")
-        for name in ("clutter_width", "beta_static", "beta_vehicle", "beta_flow", "spacing"):
+        if not self.reach > 0:
+            raise InputError(f"reach is {self.reach}; give the metres that the camera sees, or inf")
+        for name in ("clutter_width", "reach_std", "beta_static", "beta_vehicle", "beta_flow", "spacing"):
             value = getattr(self, name)
             if not math.isfinite(value) or value <= 0:
                 raise InputError(f"{name} must be finite and positive, but is {value}")

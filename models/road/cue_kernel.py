@@ -4,22 +4,25 @@ At the sample of the course nearest to the cue, with direction t = (cos, sin), n
 
     along = t . (p - f),   across = n . (p - f)
 
-`exact`: the cue may be anywhere along the course (a flat density), and across it is normal about its offset o,
+`exact`: the cue stands at arc length l with density seen(l) = Phi((reach - l) / reach_std), for cameras see so far and
+not farther; across the course it is normal about its offset o,
 
     lateral  = across - k along^2 / 2 - o          distance from the parabola through the sample
-    variance = m' Sigma m + spread^2               m the normal at the foot of the cue
+    variance = m' Sigma m + spread^2               m the normal at the foot of the cue, t the tangent
+    slant    = t' Sigma m / variance               how far along a cue is moved for each metre across
     turn     = wrap(direction of motion - heading - k along - pi of oncoming traffic)
-    p        = (1 - clutter) N(lateral; 0, variance) N(turn; 0, flow) + clutter / width / (2 pi)
+    sight    = (reach - l - along + slant lateral) / sqrt(reach_std^2 + t' Sigma t - slant t' Sigma m)
+    p        = (1 - clutter) N(lateral; 0, variance) N(turn; 0, flow) Phi(sight) + clutter / width / (2 pi)
 
-where clutter is anything that does not follow the road: a false detection, a side street, a vehicle changing lanes. In
-a bend, noise along the road moves cues across it by the order of k Sigma: less than a tenth of a standard deviation,
+Phi(sight) is the mean of seen(l) over where the cue may stand, given where it was measured. Without it the last cues
+are taken where noise has put them, beyond the sight as often as not, and bends are underestimated there. Clutter is anything that does not follow the road: a false detection, a side street, a vehicle changing lanes. In a bend, noise along the road moves cues across it by the order of k Sigma: less than a tenth of a standard deviation,
 and no correction of that order that was tried made slopes at the truth less biased.
 
 `paper`, [T17] eq. 4 and 5: the error is the distance from the predicted point on the normal of the sample, and one less
 the correlation of the directions; both normal with variance sigma^2 / beta. There is no clutter.
 
 Residuals r_i and rows J_i are such that -weight sum_i r_i J_i is the gradient of the log density in the local numbers
-(along, across, heading, curvature, offset) and weight sum_i J_i J_i' its expected curvature; weight is the probability
+(along, across, heading, curvature, offset, arc length of the sample) and weight sum_i J_i J_i' its expected curvature; weight is the probability
 that the cue follows the road.
 """
 
@@ -29,18 +32,22 @@ import math
 
 import numba as nb
 
-from models.clothoid_kernel import BEND, COS, HEADING, SIN, X, Y
+from models.clothoid_kernel import ARC, BEND, COS, HEADING, SIN, X, Y
 from models.intersection.wrap import wrap
 
 # columns of a cue
-PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER = range(11)
-WIDTH = 11  # SPREAD is a variance [m^2], PRECISION 1 / std [1/rad], CONSTANT a log density, CLUTTER a density or 0
+PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER, REACH, BLUR = range(13)
+WIDTH = 13  # SPREAD and BLUR (reach_std^2) are variances [m^2], PRECISION 1 / std [1/rad], CONSTANT a log density,
+# CLUTTER a density or 0, REACH [m] from the start of the course, inf for no end of the sight
+RESIDUALS, LOCAL = 4, 7  # of a cue, at most; a residual and its slopes in along, across, heading, curvature, offset, arc
 ROOT_HALF = math.sqrt(0.5)
+LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
+FAR_INSIDE = 6.0  # standard deviations of sight from where log Phi is flat
 
 
 @nb.njit(error_model="numpy")
 def nearest_sample(cues, n, table, step):  # type: ignore[no-untyped-def]
-    """The sample of a table (num, 6) that is nearest to cue n, by a walk from where the chord says it is."""
+    """The sample of a table (num, 7) that is nearest to cue n, by a walk from where the chord says it is."""
     last = len(table) - 1
     chord_x, chord_y = table[last, X] - table[0, X], table[last, Y] - table[0, Y]
     share = ((cues[n, PX] - table[0, X]) * chord_x + (cues[n, PY] - table[0, Y]) * chord_y) / (chord_x**2 + chord_y**2)
@@ -60,7 +67,7 @@ def nearest_sample(cues, n, table, step):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
-    """(log density, weight) of cue n about sample k; residuals (3,) and their rows (3, 5) into rows (3, 6), if any."""
+    """(log density, weight) of cue n about sample k; residuals and their slopes into rows (RESIDUALS, LOCAL), if any."""
     c, s, bend = table[k, COS], table[k, SIN], table[k, BEND]
     dx, dy = cues[n, PX] - table[k, X], cues[n, PY] - table[k, Y]
     along, across = dx * c + dy * s, dy * c - dx * s
@@ -73,6 +80,13 @@ def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
     e = lateral * root
     turn = wrap(cues[n, FLOW] - table[k, HEADING] - q - cues[n, TURN]) * cues[n, PRECISION]
     log_road, weight = cues[n, CONSTANT] - 0.5 * (e * e + turn * turn), 1.0
+    skew = norm * (my * sx - mx * sy)  # t' Sigma m
+    slant, blur, sight = skew / variance, 1.0, math.inf
+    if cues[n, REACH] < math.inf:
+        blur = math.sqrt(cues[n, BLUR] + cues[n, SXX] + cues[n, SYY] - (variance - cues[n, SPREAD]) - slant * skew)
+        sight = (cues[n, REACH] - table[k, ARC] - along + slant * lateral) / blur
+    if sight < FAR_INSIDE:
+        log_road += log_normal_share(sight)
     if cues[n, CLUTTER] > 0.0:
         road = root * math.exp(log_road)
         weight = road / (road + cues[n, CLUTTER])
@@ -81,14 +95,36 @@ def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
         log_density = log_road + math.log(root)
     if len(rows) == 0:
         return log_density, weight
-    swing = -2.0 * ROOT_HALF * norm * (my * sx - mx * sy) / variance  # d variance / d heading, over sqrt(2) variance
-    rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3] = e, -q * root, root, 0.0
+    rows[:] = 0.0
+    swing = -2.0 * ROOT_HALF * slant  # d variance / d heading, over sqrt(2) variance
+    rows[0, 0], rows[0, 1], rows[0, 2] = e, -q * root, root
     rows[0, 4], rows[0, 5] = -0.5 * along * along * root, -root
-    rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3] = (1.0 - e * e) * ROOT_HALF, swing * norm * bend, 0.0, swing
-    rows[1, 4], rows[1, 5] = swing * norm * along, 0.0
-    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = turn, -bend * cues[n, PRECISION], 0.0, -cues[n, PRECISION]
-    rows[2, 4], rows[2, 5] = -along * cues[n, PRECISION], 0.0
+    rows[1, 0], rows[1, 1], rows[1, 3] = (1.0 - e * e) * ROOT_HALF, swing * norm * bend, swing
+    rows[1, 4] = swing * norm * along
+    rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * cues[n, PRECISION], -cues[n, PRECISION]
+    rows[2, 4] = -along * cues[n, PRECISION]
+    if sight < FAR_INSIDE:
+        inverse_mills = math.exp(-0.5 * sight * sight - LOG_ROOT - log_normal_share(sight))
+        pull = math.sqrt(inverse_mills * (sight + inverse_mills))  # of the curvature of log Phi
+        unlike = 2.0 * (variance - cues[n, SPREAD]) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
+        slant_turn = (unlike + 2.0 * slant * skew) / variance  # d slant / d heading
+        blur_turn = 2.0 * (skew - slant * unlike - slant * slant * skew)  # d blur^2 / d heading
+        by_turn = (slant_turn * lateral - 0.5 * sight * blur_turn / blur) / blur
+        scale = pull / blur
+        rows[3, 0] = -inverse_mills / pull
+        rows[3, 1], rows[3, 2] = -scale * (1.0 + slant * q) + pull * by_turn * norm * bend, scale * slant
+        rows[3, 3], rows[3, 5], rows[3, 6] = pull * by_turn, -scale * slant, -scale
+        rows[3, 4] = -0.5 * scale * slant * along * along + pull * by_turn * norm * along
     return log_density, weight
+
+
+@nb.njit(error_model="numpy")
+def log_normal_share(x):  # type: ignore[no-untyped-def]
+    """log Phi(x)."""
+    if x > -6.0:
+        return math.log(0.5 * math.erfc(-x * ROOT_HALF))
+    y = 1.0 / (x * x)
+    return -0.5 * x * x - math.log(-x) - LOG_ROOT + math.log1p(-y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y))))
 
 
 @nb.njit(error_model="numpy")

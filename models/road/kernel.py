@@ -15,11 +15,10 @@ import numpy as np
 
 from models.clothoid_kernel import COLUMNS, COS, LENGTH, SIN, hermite_one, sample_one
 from models.road.course_slopes import hermite_slopes, moments, sample_row
-from models.road.cue_kernel import nearest_sample, score_cue
+from models.road.cue_kernel import LOCAL, LOG_ROOT, RESIDUALS, nearest_sample, score_cue
 from models.road.numbers import affine, course_density
 
 NO_ROAD = -1e9  # [nats]
-LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
 
 
 @nb.njit(error_model="numpy")
@@ -41,7 +40,7 @@ def group_densities(x, course, num, paper, cues, group, loc, std, out):  # type:
     paper   whether as printed
     cues    (N, WIDTH) as in models.road.cue_kernel, group (N,) of each
     loc, std  (G,) of the offsets"""
-    theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((0, 6))
+    theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((0, LOCAL))
     none, empty = np.empty(0), np.empty((0, 0))
     for i in range(len(x)):
         height = correction(x[i], *course, theta, none, empty)
@@ -61,7 +60,7 @@ def linearise(theta, offset, num, paper, cues, group, gradient, hessian):  # typ
     """Log density of all cues beside the clothoid theta (6,) at offsets (G,) [m]; its gradient (6 + G,) in both and,
     unless empty, minus its expected second derivatives (6 + G, 6 + G), of which the lower half is filled."""
     full = len(hessian) > 0
-    table, rows = np.empty((num, COLUMNS)), np.empty((3, 6))
+    table, rows = np.empty((num, COLUMNS)), np.empty((RESIDUALS, LOCAL))
     moment, row = np.empty((num, 4)), np.empty(6)
     step, total = sample_one(theta, table), 0.0
     moments(table, step, moment)
@@ -74,10 +73,14 @@ def linearise(theta, offset, num, paper, cues, group, gradient, hessian):  # typ
         c, s = table[k, COS], table[k, SIN]
         dx, dy = cues[n, 0] - table[k, 0], cues[n, 1] - table[k, 1]
         along, across = dx * c + dy * s, dy * c - dx * s
-        for r in range(3):
+        share = k / (num - 1.0)
+        for r in range(RESIDUALS):
+            if rows[r, 1] == 0.0 and rows[r, 2] == 0.0 and rows[r, 3] == 0.0:  # says nothing
+                continue
             residual, u, v, by_offset = rows[r, 0], rows[r, 1], rows[r, 2], rows[r, 5]
             turn = rows[r, 3] + u * across - v * along
             sample_row(v * s - u * c, -u * s - v * c, turn, rows[r, 4], k, theta, table, moment, row)
+            row[LENGTH] += rows[r, 6] * share
             gradient[o] -= weight * residual * by_offset
             for i in range(6):
                 gradient[i] -= weight * residual * row[i]
@@ -189,7 +192,7 @@ def slopes_in_course(z, num, paper, cues, group, gradient):  # type: ignore[no-u
 def explain(z, num, paper, cues, group, out):  # type: ignore[no-untyped-def]
     """Of every cue its lateral residual and its residual in direction, both in standard deviations, and the probability
     that it follows the road, out (N, 3), at a course C and offsets [m], z (6 + G,)."""
-    theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((3, 6))
+    theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((RESIDUALS, LOCAL))
     hermite_one(z[0], z[1], z[2], z[3], z[4], z[5], theta)
     if theta[LENGTH] == np.inf:
         out[:] = np.nan

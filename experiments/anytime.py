@@ -189,9 +189,7 @@ def draw(records: list[dict[str, Any]], found: dict[str, Outcomes]) -> Figure:
     left.set_xticks([0.25, 0.5, 0.75, 1.0])
     left.xaxis.set_major_formatter(PercentFormatter(1.0))
     left.yaxis.set_major_formatter(PercentFormatter(1.0))
-    right.set(xlabel="iterations; the dot: 100 %")
-    right.set_xscale("symlog", linthresh=3.0)
-    right.xaxis.set_major_formatter("{x:.0f}")
+    right.set(xlabel="iterations; the dot: 100 %", xlim=(0, None))
     for axes, title in ((left, "TPR solid, FPR dotted"), (right, "the same along the iterations")):
         axes.set_title(title, loc="left", fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)

@@ -214,14 +214,15 @@ def main() -> None:
 
 
 def compare(words: list[str]) -> None:
-    """Plan, run, tabulate, store. Raises JobFailed at the end where an engine failed: one that refuses
-    the model only if it was asked for by name or none is left."""
+    """Plan, run, tabulate, store. Raises JobFailed at the end where an engine failed: one that refuses the model only
+    if it was asked for by name or none is left. Where all refuse, that is a mistake of use: exit code 2."""
     chosen = plan(words)
     tasks = tasks_of(chosen)
     rows = gather(tasks)
     conclude(chosen, tasks, rows)
-    ran = any(row.cells for row in rows)
-    if not ran or any(row.error and (chosen.named or not row.refused) for row in rows):
+    if all(row.refused for row in rows):
+        raise JobFailed(2)
+    if any(row.error and (chosen.named or not row.refused) for row in rows):
         raise JobFailed(1)
 
 

@@ -19,16 +19,22 @@ from tests.small_junction import FULL, NOTHING, blank_evidence, one, with_points
 
 
 @pytest.fixture(scope="module")
-def found() -> tuple[Posterior, Any]:
+def found() -> tuple[Posterior, Posterior, Any]:
+    """The posterior of both engines, that of the refining one alone, and the evidence."""
     truth = one(simulate(FULL, NOTHING, num=1, seed=5), 0)
     evidence = with_points(FULL, truth, blank_evidence(8, 8, 10), 1)
     structure = lambda model, data, *, seed: rjmcmc.run(model, data, seed=seed, num_steps=500, warmup=500)  # noqa: E731
     knobs: dict[str, Any] = {"num_steps": 10, "num_samples": 16, "num_draws": 100, "num_snapshots": 2}
-    refine = lambda model, data, *, seed, init: bbvi.run(model, data, seed=seed, init=init, **knobs)  # noqa: E731
-    return estimate(FULL, evidence, seed=0, structure=structure, refine=refine), evidence
+    refined: list[Posterior] = []
+
+    def refine(model: Any, data: Any, **given: Any) -> Posterior:
+        refined.append(bbvi.run(model, data, **knobs, **given))
+        return refined[-1]
+
+    return estimate(FULL, evidence, seed=0, structure=structure, refine=refine), refined[0], evidence
 
 
-def test_draws_hold_the_fixed_structure_beside_the_numbers(found: tuple[Posterior, Any]) -> None:
+def test_draws_hold_the_fixed_structure_beside_the_numbers(found: tuple[Posterior, Posterior, Any]) -> None:
     posterior = found[0]
     assert posterior.shape == (1, 100)
     for site in ("num_arms", "entries", "exits"):
@@ -38,10 +44,14 @@ def test_draws_hold_the_fixed_structure_beside_the_numbers(found: tuple[Posterio
     assert posterior.model_index is not None and posterior.log_evidence is None
 
 
-def test_snapshots_run_on_from_those_of_the_structure_under_one_density(found: tuple[Posterior, Any]) -> None:
-    posterior, evidence = found
+def test_snapshots_run_on_from_those_of_the_structure_under_one_density(
+    found: tuple[Posterior, Posterior, Any],
+) -> None:
+    posterior, refined, evidence = found
     shots = posterior.snapshots
-    assert shots is not None
+    assert shots is not None and refined.snapshots is not None
+    later = shots.seconds[-len(refined.snapshots.step) :] - refined.snapshots.seconds
+    assert np.ptp(later) < 1e-9 and later[0] >= posterior.info["structure_seconds"]
     assert np.all(np.diff(shots.seconds) >= 0) and np.all(np.diff(shots.step) >= 0)
     assert posterior.info["structure_seconds"] < posterior.info["seconds"]
     for i in (0, len(shots.step) - 1):  # the first is of the structure engine, the last of the refinement

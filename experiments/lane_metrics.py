@@ -83,11 +83,14 @@ def lane_error(lines: list[Floats], truth: JunctionTruth) -> dict[str, float]:
 def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
     """`lane_error` of a posterior with lanes, and how honest its bands are; nothing without lanes or without a truth.
 
-    band_coverage  share of the lanes' nodes whose true place is inside the 90 % band"""
+    band_coverage  share of the lanes' nodes whose true place is inside the 90 % band
+    half_band_cm   half the width of that band, mean over all nodes"""
     lanes = getattr(posterior, "lanes", None)
     if lanes is None or scene.truth is None:
         return {}
-    return lane_error(lanes.lines, scene.truth) | {"band_coverage": band_coverage(lanes, scene.truth)}
+    widths = np.concatenate([left + right for left, right in zip(lanes.left, lanes.right, strict=True)] or [[math.nan]])
+    bands = {"band_coverage": band_coverage(lanes, scene.truth), "half_band_cm": 50.0 * float(widths.mean())}
+    return lane_error(lanes.lines, scene.truth) | bands
 
 
 def band_coverage(lanes: Lanes, truth: JunctionTruth) -> float:

@@ -100,6 +100,8 @@ def with_lanes(
             "lanes": len(best.lines),
             "readings": len(sound),
             "readings_share": readings.covered * total,
+            "evaluations": found.info.get("evaluations", 0) + sum(map(_evaluations, seen)),
+            "seconds": found.info.get("seconds", 0.0) + time.perf_counter() - began,
             "lane_seconds": time.perf_counter() - began,
             "flags": flags,
         }
@@ -119,6 +121,10 @@ def with_lanes(
         lane_width=float(posterior.estimate.get("lane_width", mean_width(model, found.estimate))),
         courses=posterior,
     )
+
+
+def _evaluations(seen: tuple[Reading, Refined | None]) -> int:
+    return 0 if seen[1] is None else int(seen[1][0].info.get("evaluations", 0))
 
 
 def _converged(refined: Refined | None) -> bool:

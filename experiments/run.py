@@ -47,7 +47,7 @@ class Result(NamedTuple):
     diagnostics  {scalar: mean, sd, r_hat, ess_bulk, mcse} (inference.diagnostics.summary)
     flags        what speaks against the draws, in words
     figures      {name: figure}
-    seconds      {stage: seconds}
+    seconds      {stage: seconds}, and under "engine, processor" the processor time of that stage
     failures     {what failed once the engine had run: its exception}; the rest is complete
     """
 
@@ -71,9 +71,11 @@ def run(
     metrics: Iterable[Metric] = (),
     figures: Iterable[Draw] = (),
     say: Callable[[str], None] = lambda line: None,
+    warm_up: bool = False,
 ) -> Result:
     """Run one experiment. Raises InputError where scenario, model and engine do not fit.
 
+    warm_up      run the engine once before, unmeasured: no compilation then counts in its seconds
     functionals  posterior -> {name: (chain, draw)}, further scalars for the diagnostics: where slots hold
                  a set, only what no relabelling changes can be compared between draws
 
@@ -110,8 +112,12 @@ def run(
         evidence = model.prepare(scene.data) if hasattr(model, "prepare") else scene.data
         check(model, evidence)
     say(f"model      {type(model).__name__}")
+    if warm_up:
+        _infer(engine, model, evidence, engine_seed(seed))
+    worked = time.process_time()
     with stage("engine"):
         posterior = _infer(engine, model, evidence, engine_seed(seed))
+    seconds["engine, processor"] = time.process_time() - worked
     say(f"posterior  {' x '.join(map(str, posterior.shape))} draws in {seconds['engine']:.2f} s")
     with stage("metrics"):
         scores = {name: float(value) for name, value in collect("metric", metrics, posterior, scene).items()}
@@ -135,10 +141,12 @@ def _infer(engine: Engine, model: Any, evidence: Any, seed: int) -> Posterior:
     except InputError as error:
         if "fix()" not in str(error) or not hasattr(model, "moves"):
             raise
-        fit = ["engine=rjmcmc"] + (["engine=rjmcmc_structure"] if hasattr(model, "start") else [])
+        fit = "engine=rjmcmc"
+        if hasattr(model, "start"):
+            fit += ", rjmcmc_structure or, its structure fixed, bbvi_structure"
         raise InputError(
             f"{type(model).__name__} counts with discrete latents, which this engine does not sample; "
-            f"choose {' or '.join(fit)} (from Python: {error})"
+            f"choose {fit} (from Python: {error})"
         ) from error
 
 
@@ -196,7 +204,7 @@ def _check(settings: dict[str, Any]) -> None:
     for name, seed in (("seed", settings["seed"]), ("scenario.seed", settings["scenario"].get("seed"))):
         if isinstance(seed, int) and seed < 0:
             raise ConfigError(f"{name} is {seed}; choose 0 or more")
-    for name in ("functionals", "metrics", "figures"):
+    for name in ("functionals", "metrics", "figures", "compare_figures"):
         value = settings[name]
         if not isinstance(value, list) or not all(isinstance(v, dict) and v.get("_partial_") for v in value):
             raise ConfigError(
@@ -205,34 +213,49 @@ def _check(settings: dict[str, Any]) -> None:
             )
 
 
-def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
+_warm: set[str] = set()  # scenario, model and engine of runs that this process has done
+
+
+def execute(job: Job, say: Callable[[str], None] = print, *, timed: bool = False) -> dict[str, float]:
     """Run a job and store its outcome, or read it where that is done already; the scores.
 
+    timed  its seconds are to be compared: an engine that this process has not run yet runs once before, unmeasured,
+           and what is stored without such a warm-up runs again
+
     Raises Incomplete, all else being stored, where something failed after the engine."""
-    if store.is_done(job.folder) and not job.force:
+    pair = job.name.rpartition("-")[0]
+    if store.is_done(job.folder) and not job.force and (not timed or is_warm(job.folder)):
         say(f"done already: {job.folder} (force=true runs it again)")
         return dict(store.read_json(job.folder / "scores.json"))
     parts = {key: build(job.config[key], key) for key in ("model", "engine", "functionals", "metrics", "figures")}
     scenario = job.config["scenario"]
-    result = run(lambda: build(scenario, "scenario"), **parts, seed=job.config["seed"], say=say)
-    failures = write(job, result)
+    warm_up = timed and pair not in _warm
+    result = run(lambda: build(scenario, "scenario"), **parts, seed=job.config["seed"], say=say, warm_up=warm_up)
+    failures = write(job, result, warm_up or pair in _warm)
+    _warm.add(pair)
     if failures:
         raise Incomplete(job.folder, failures)
     return result.scores
 
 
-def write(job: Job, result: Result) -> dict[str, Exception]:
+def is_warm(folder: Path) -> bool:
+    """Whether the engine of a stored run had run in its process before: then its seconds hold no compilation."""
+    return bool(store.read_json(folder / "manifest.json").get("warm"))
+
+
+def write(job: Job, result: Result, warm: bool = False) -> dict[str, Exception]:
     """Store a result in the folder of its job; all failures, those of writing figures and report included."""
     from experiments.junction_metrics import arms
     from experiments.lane_posterior import LanePosterior
     from experiments.report import save_figures, write_report
+    from inference.diagnostics import summary
 
     seeds = {"run": job.config["seed"], "engine": engine_seed(job.config["seed"])}
     with store.writing(job.folder) as folder:
         store.write_json(folder / "scores.json", result.scores)
         store.write_json(folder / "diagnostics.json", {"summary": result.diagnostics, "flags": result.flags})
         result.posterior.save(folder)
-        manifest = store.manifest(job.name, job.config, seeds, result.seconds, result.scene.info)
+        manifest = store.manifest(job.name, job.config, seeds, result.seconds, result.scene.info) | {"warm": warm}
         images, unsaved = save_figures(folder, result.figures)
         failures = result.failures | unsaved
         try:
@@ -240,6 +263,8 @@ def write(job: Job, result: Result) -> dict[str, Exception]:
             if found:
                 store.write_rows(folder / "arms.csv", found)
             lanes = result.posterior.table() if isinstance(result.posterior, LanePosterior) else []
+            if isinstance(result.posterior, LanePosterior) and result.posterior.courses is not None:
+                store.write_json(folder / "courses.json", summary(result.posterior.courses))
             tables = {"Arms found": found, "Lanes found": lanes}
             write_report(folder, job.name, result, tables, images, failures, manifest)
         except Exception as error:

@@ -4,6 +4,7 @@
         manifest.json  scores.json  diagnostics.json  posterior.npz  posterior.json
         arms.csv       where the estimate is a junction
         lanes.csv  lanes.npz  lanes.osm   where it has lanes
+        courses.json   diagnostics of the numbers of their courses
         figures/*.png  report.html
 
 The identity is a hash of the resolved config, of the source code and of the input files: a run that

@@ -7,10 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from experiments.lane_metrics import COST, _mean_distance, distance_to_line, lane_error, region
+from experiments.lane_metrics import COST, _mean_distance, distance_to_line, lane_error, metrics, region
+from experiments.lane_posterior import LanePosterior, Lanes
 from experiments.scenarios import paths
 from experiments.scenarios.protocol import protocol
-from experiments.scenarios.scene import JunctionTruth
+from experiments.scenarios.scene import JunctionTruth, Scene
+from inference.posterior import Posterior
+from models.intersection.routes import Routes
 from models.program import InputError
 
 X = np.arange(-60.0, 60.01, 0.25)
@@ -149,3 +152,18 @@ def test_inside_and_arms_part_at_the_larger_radius_of_the_two_arms() -> None:
 def test_lines_that_are_none_are_refused_by_number(bad: np.ndarray, named: str) -> None:
     with pytest.raises(InputError, match=named):
         lane_error([at(0.0), bad], roads(0.0))
+
+
+def test_bands_are_scored_by_what_they_hold_and_by_their_width() -> None:
+    """A lane .5 m beside the true one: the band of .6 m holds it, that of .4 m does not; half their mean is .5 m."""
+    line, truth = at(0.5), roads(0.0)
+    half = len(line) // 2
+    wide = np.where(np.arange(len(line)) < half, 0.6, 0.4)
+    lanes = Lanes(
+        [line], [wide], [wide], Routes(truth.connections[:1], np.zeros(len(truth.track_lane), dtype=np.int64))
+    )
+    posterior = LanePosterior({"z": np.zeros((1, 2))}, lanes=lanes)
+    scores = metrics(posterior, Scene(None, truth, "here", {}))
+    assert scores["half_band_cm"] == pytest.approx(100.0 * wide.mean())
+    assert scores["band_coverage"] == pytest.approx(half / len(line), abs=0.5 / len(line) + 0.02)
+    assert metrics(Posterior({"z": np.zeros((1, 2))}), Scene(None, truth, "here", {})) == {}

@@ -149,6 +149,7 @@ def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
 
     error_40_m ..       distance of the true course from the estimate at 40, 80 and 140 m
     spread_40_m ..      its posterior standard deviation
+    covered_40 ..       1 where the 90 % band there holds the truth
     inside_mid ..       1 where the estimate is inside the tube to 140 m
     range_m             calibrated range, 0 where even the first metres are not trusted
     trusted_true        1 where the estimate is inside the mid tube up to there, 0 where not, nan for an abstention
@@ -160,6 +161,7 @@ def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
     for distance in TOLD:
         i = found.at(distance)
         out |= {f"error_{distance:.0f}_m": abs(found.error[i]), f"spread_{distance:.0f}_m": found.spread[i]}
+        out |= {f"covered_{distance:.0f}": float(found.covered[i])}
     out |= {f"inside_{tube}": float(found.inside(tube)) for tube in TUBES}
     right = {"true": 1.0, "false": 0.0, "none": math.nan}[found.outcome]
     return out | {"range_m": found.reach, "trusted_true": right, "coverage": float(found.covered.mean())}

@@ -72,16 +72,25 @@ def linearise(squares: Squares, scale: Array, x: Array, hessian: Array) -> State
 
 
 def minimise(
-    squares: Squares, x: Array, *, num_steps: int, damping: float, tolerance: float, learn: tuple[str, ...] = ()
+    squares: Squares,
+    x: Array,
+    *,
+    num_steps: int,
+    damping: float,
+    tolerance: float,
+    learn: tuple[str, ...] = (),
+    began: float | None = None,
 ) -> Path:
-    """From x (D,) on; at most num_steps; stop where a step promises less than `tolerance` [nats].
+    """From x (D,) on; at most num_steps; stop where a step promises less than `tolerance` [nats]. Seconds count from
+    `began` on, a reading of time.perf_counter.
 
     Where steps are refused again and again, damping grows until none promises much: that is converged only if an
     undamped step does not promise more than STALL either."""
     unknown = [name for name in learn if name not in squares.sites]
     if unknown:
         raise InputError(f"learn names {', '.join(unknown)}, but the latents are {', '.join(squares.sites)}")
-    began, scale, growth, stopped = time.perf_counter(), squares.scale, 2.0, False
+    began = time.perf_counter() if began is None else began
+    scale, growth, stopped = squares.scale, 2.0, False
     shape = arrow(squares.blocks, len(x))
     own, spare = (np.empty((*shape.slots.shape, shape.slots.shape[1])) for _ in range(2))
     state = linearise(squares, scale, x, own)
@@ -154,7 +163,8 @@ def run(
         missing = sorted(squares.sites.keys() - init.keys())
         raise InputError(f"init has no value for {missing}; it holds {sorted(init)}")
     x = np.zeros(len(squares.loc)) if init is None else (squares.pack(init) - squares.loc) / squares.scale
-    path = minimise(squares, x, num_steps=num_steps, damping=damping, tolerance=tolerance, learn=learn)
+    knobs: dict[str, Any] = {"num_steps": num_steps, "damping": damping, "tolerance": tolerance, "learn": learn}
+    path = minimise(squares, x, **knobs, began=began)
     noise = np.random.default_rng(np.random.SeedSequence(seed)).standard_normal((num_draws, len(x)))
     numbers = path.state.x + colour(path.factor, noise)
     times, misfits, visited = zip(*path.visited, strict=True)

@@ -15,15 +15,17 @@ not farther; across the course it is normal about its offset o,
     p        = (1 - clutter) N(lateral; 0, variance) N(turn; 0, flow) Phi(sight) + clutter / width / (2 pi)
 
 Phi(sight) is the mean of seen(l) over where the cue may stand, given where it was measured. Without it the last cues
-are taken where noise has put them, beyond the sight as often as not, and bends are underestimated there. Clutter is anything that does not follow the road: a false detection, a side street, a vehicle changing lanes. In a bend, noise along the road moves cues across it by the order of k Sigma: less than a tenth of a standard deviation,
-and no correction of that order that was tried made slopes at the truth less biased.
+are taken where noise has put them, beyond the sight as often as not, and bends are underestimated there: by a third of
+a standard deviation at 140 m. Clutter is anything that does not follow the road: a false detection, a side street, a
+vehicle changing lanes. In a bend, noise along the road moves cues across it by the order of k Sigma: less than a tenth
+of a standard deviation, and no correction of that order that was tried made slopes at the truth less biased.
 
 `paper`, [T17] eq. 4 and 5: the error is the distance from the predicted point on the normal of the sample, and one less
-the correlation of the directions; both normal with variance sigma^2 / beta. There is no clutter.
+the correlation of the directions; both normal with variance sigma^2 / beta. There is no clutter and no end of sight.
 
 Residuals r_i and rows J_i are such that -weight sum_i r_i J_i is the gradient of the log density in the local numbers
-(along, across, heading, curvature, offset, arc length of the sample) and weight sum_i J_i J_i' its expected curvature; weight is the probability
-that the cue follows the road.
+(along, across, heading, curvature, offset, arc length of the sample), and weight sum_i J_i J_i' its expected curvature;
+weight is the probability that the cue follows the road.
 """
 
 from __future__ import annotations
@@ -39,7 +41,10 @@ from models.intersection.wrap import wrap
 PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER, REACH, BLUR = range(13)
 WIDTH = 13  # SPREAD and BLUR (reach_std^2) are variances [m^2], PRECISION 1 / std [1/rad], CONSTANT a log density,
 # CLUTTER a density or 0, REACH [m] from the start of the course, inf for no end of the sight
-RESIDUALS, LOCAL = 4, 7  # of a cue, at most; a residual and its slopes in along, across, heading, curvature, offset, arc
+RESIDUALS, LOCAL = (
+    4,
+    7,
+)  # of a cue, at most; a residual and its slopes in along, across, heading, curvature, offset, arc
 ROOT_HALF = math.sqrt(0.5)
 LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
 FAR_INSIDE = 6.0  # standard deviations of sight from where log Phi is flat
@@ -67,7 +72,7 @@ def nearest_sample(cues, n, table, step):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
-    """(log density, weight) of cue n about sample k; residuals and their slopes into rows (RESIDUALS, LOCAL), if any."""
+    """(log density, weight) of cue n about sample k; residuals and slopes into rows (RESIDUALS, LOCAL), if any."""
     c, s, bend = table[k, COS], table[k, SIN], table[k, BEND]
     dx, dy = cues[n, PX] - table[k, X], cues[n, PY] - table[k, Y]
     along, across = dx * c + dy * s, dy * c - dx * s

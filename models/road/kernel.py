@@ -1,9 +1,9 @@
 """The density of all cues in machine code: group by group, with its gradient, and as normal equations.
 
 Everything is computed in the numbers of the clothoid. What comes from C passes through the Hermite fit first
-(`slopes_in_course`); engines run on the whitened numbers of models.road.numbers. Groups share an offset, so that the log
-density is one factor of the course and a sum over groups g of f_g(theta, o_g). Where there is no sane clothoid every
-factor is NO_ROAD: low enough for any engine to leave it, and finite, so that none breaks.
+(`slopes_in_course`); engines run on the whitened numbers of models.road.numbers. Groups share an offset, so that the
+log density is one factor of the course and a sum over groups g of f_g(theta, o_g). Where there is no sane clothoid
+every factor is NO_ROAD: low enough for any engine to leave it, and finite, so that none breaks.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def group_densities(x, course, num, paper, cues, group, loc, std, out):  # type:
     theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((0, LOCAL))
     none, empty = np.empty(0), np.empty((0, 0))
     for i in range(len(x)):
-        height = correction(x[i], *course, theta, none, empty)
+        height = correction(x[i], *course, theta, none, empty)  # type: ignore[call-arg]
         out[i] = 0.0 if height > -np.inf else NO_ROAD
         if height == -np.inf:
             continue
@@ -129,7 +129,7 @@ def whitened_slopes(x, offset, course, num, paper, cues, group, gradient, hessia
     these and, unless empty, the lower half of minus its second derivatives, after Gauss and Newton."""
     theta, by_course = np.empty(6), np.empty(6)
     square = np.empty((6, 6)) if len(hessian) > 0 else np.empty((0, 0))
-    height = correction(x, *course, theta, by_course, square)
+    height = correction(x, *course, theta, by_course, square)  # type: ignore[call-arg]
     if height == -np.inf:
         gradient[:] = 0.0
         hessian[:] = 0.0

@@ -59,10 +59,10 @@ def prior_root(prior: CoursePrior) -> tuple[Floats, Floats]:
 def to_numbers(course: Floats, prior: CoursePrior) -> Floats:
     """Whitened numbers (6,) of a course C (6,). Raises InputError where no sane clothoid joins its ends."""
     theta, (mean, tril) = np.empty(6), number_moments(prior)
-    hermite_one(*np.asarray(course, dtype=np.float64).reshape(6), theta)
+    hermite_one(*np.asarray(course, dtype=np.float64).reshape(6), theta)  # type: ignore[call-arg]
     if theta[LENGTH] == np.inf:
         raise InputError(f"no clothoid joins the ends of the course {course}; give start and end of a drivable road")
-    return np.linalg.solve(tril, theta - mean)
+    return np.asarray(np.linalg.solve(tril, theta - mean))
 
 
 def to_courses(x: Floats, prior: CoursePrior) -> Floats:
@@ -90,14 +90,14 @@ def affine(x, mean, tril, theta):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def moments_of(theta, out):  # type: ignore[no-untyped-def]
-    """M_k, out (5, 2), from the start to the end of a clothoid; returns how far it turns [rad]."""
+    """M_k of k = 0, .., out (num, 2), from the start to the end of a clothoid; returns how far it turns [rad]."""
     curvature, rate, length = theta[CURVATURE], theta[RATE], theta[LENGTH]
     out[:] = 0.0
     for i in range(len(NODES)):
         s = length * NODES[i]
         angle, power = s * (curvature + 0.5 * rate * s), length * WEIGHTS[i]
         cos, sin = math.cos(angle), math.sin(angle)
-        for k in range(5):
+        for k in range(len(out)):
             out[k, 0] += power * cos
             out[k, 1] += power * sin
             power *= s
@@ -116,16 +116,17 @@ def end_of(theta, moment, turn, course):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def cross(a, b, out):  # type: ignore[no-untyped-def]
+    """a x b into out (3,)."""
     out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @nb.njit(error_model="numpy")
 def end_columns(theta, moment, turn, columns):  # type: ignore[no-untyped-def]
-    """d(x, y, heading) of the end / d(curvature, rate, length), each a row of columns (3, 3); returns its determinant."""
-    length = theta[LENGTH]
+    """d(x, y, heading) of the end / d(curvature, rate, length), each a row of (3, 3); returns its determinant."""
+    length, last = theta[LENGTH], theta[CURVATURE] + theta[RATE] * theta[LENGTH]
     columns[0, 0], columns[0, 1], columns[0, 2] = -moment[1, 1], moment[1, 0], length
     columns[1, 0], columns[1, 1], columns[1, 2] = -0.5 * moment[2, 1], 0.5 * moment[2, 0], 0.5 * length**2
-    columns[2, 0], columns[2, 1], columns[2, 2] = math.cos(turn), math.sin(turn), theta[CURVATURE] + theta[RATE] * length
+    columns[2, 0], columns[2, 1], columns[2, 2] = math.cos(turn), math.sin(turn), last
     normal = np.empty(3)
     cross(columns[1], columns[2], normal)
     return normal[0] * columns[0, 0] + normal[1] * columns[0, 1] + normal[2] * columns[0, 2]
@@ -136,21 +137,18 @@ def volume_slopes(theta, moment, turn, columns, det, slopes):  # type: ignore[no
     """d log det / d(curvature, rate, length), slopes (3,)."""
     length = theta[LENGTH]
     cos, sin = columns[2, 0], columns[2, 1]
-    bent = np.empty((3, 3))
-    normal = np.empty(3)
+    bent, normal = np.empty((3, 3)), np.empty(3)
     slopes[:] = 0.0
     for number in range(3):
-        if number < 2:
-            half = 0.5**number  # the rate bends by s^2 / 2 where the curvature bends by s
-            swing, spin = half * length ** (number + 1), length**number
-            for c in range(2):
-                part = half * 0.5**c
-                bent[c, 0], bent[c, 1], bent[c, 2] = -part * moment[2 + number + c, 0], -part * moment[2 + number + c, 1], 0.0
-        else:
-            swing, spin = columns[2, 2], theta[RATE]
-            for c in range(2):
+        for c in range(2):  # of the columns
+            if number < 2:
+                part, k = -(0.5 ** (number + c)), 2 + number + c  # the rate bends by s^2 / 2, the curvature by s
+                bent[c, 0], bent[c, 1], bent[c, 2] = part * moment[k, 0], part * moment[k, 1], 0.0
+            else:
                 part = 0.5**c * length ** (c + 1)
                 bent[c, 0], bent[c, 1], bent[c, 2] = -part * sin, part * cos, length**c
+        swing = columns[2, 2] if number == 2 else 0.5**number * length ** (number + 1)
+        spin = theta[RATE] if number == 2 else length**number
         bent[2, 0], bent[2, 1], bent[2, 2] = -sin * swing, cos * swing, spin
         for c in range(3):
             cross(columns[(c + 1) % 3], columns[(c + 2) % 3], normal)
@@ -210,7 +208,7 @@ def course_density(theta, mean, root, gradient, hessian):  # type: ignore[no-unt
 @nb.njit(cache=True, error_model="numpy")
 def courses_of(x, mean, tril, out):  # type: ignore[no-untyped-def]
     """C, out (S, 6), of whitened numbers x (S, 6)."""
-    theta, moment = np.empty(6), np.empty((5, 2))
+    theta, moment = np.empty(6), np.empty((1, 2))
     for i in range(len(x)):
         affine(x[i], mean, tril, theta)
         end_of(theta, moment, moments_of(theta, moment), out[i])
@@ -219,7 +217,7 @@ def courses_of(x, mean, tril, out):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, error_model="numpy")
 def volumes_of(x, mean, tril, out):  # type: ignore[no-untyped-def]
     """log |dC / dx|, out (S,), at whitened numbers x (S, 6)."""
-    theta, moment, columns = np.empty(6), np.empty((5, 2)), np.empty((3, 3))
+    theta, moment, columns = np.empty(6), np.empty((3, 2)), np.empty((3, 3))
     for i in range(len(x)):
         affine(x[i], mean, tril, theta)
         out[i] = math.log(end_columns(theta, moment, moments_of(theta, moment), columns))

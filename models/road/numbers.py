@@ -53,7 +53,7 @@ def number_moments(prior: CoursePrior) -> tuple[Floats, Floats]:
 def prior_root(prior: CoursePrior) -> tuple[Floats, Floats]:
     """Mean (6,) of C and the inverse (6, 6) of the Cholesky factor of its covariance: what `course_density` reads."""
     mean, tril = course_moments(prior)
-    return mean, np.linalg.inv(tril)
+    return mean, np.asarray(np.linalg.inv(tril))
 
 
 def to_numbers(course: Floats, prior: CoursePrior) -> Floats:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # torch and matplotlib take seconds to import: help and skipp
 Engine = Callable[..., "Posterior"]
 Metric = Callable[["Posterior", "Scene"], dict[str, float]]
 Draw = Callable[["Posterior", "Scene"], dict[str, "Figure"]]
+REMARKED = 100  # draws that a model looks at for its remarks
 Functional = Callable[["Posterior"], dict[str, Any]]
 
 
@@ -126,6 +127,10 @@ def run(
         judged = replace(posterior, draws=posterior.draws | scalars)
         found = attempt("diagnostics", lambda: {"summary": diagnostics.summary(judged)})
         poor = list(getattr(evidence, "flags", ()))  # what the model says against its evidence
+        if hasattr(model, "remarks"):
+            poor += attempt("remarks", lambda: {"": model.remarks(evidence, posterior.resample(REMARKED, 0))}).get(
+                "", []
+            )
         found |= attempt("flags", lambda: {"flags": poor + diagnostics.flags(judged)})
     with stage("figures"):
         drawn = collect("figure", figures, posterior, scene)

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from experiments.scenarios.road_layout import (
+    HISTORY,
     Layout,
     Row,
     place_markings,
@@ -36,10 +37,16 @@ Floats = NDArray[np.float64]
 MODEL = RoadCourse(clutter=0.0)
 LINE_STEP = 0.5  # of the true line [m]
 CLUTTER_REACH = 15.0  # to either side [m]
+LANE_WIDTH, CHANGE_REACH = 3.5, 60.0  # how far a change of lanes leads aside, and along the road [m]
 
 
 def night_road(
-    seed: int = 0, clutter: float = 0.0, yaw: float = 0.0, mismatch: bool = False, markings: bool = False
+    seed: int = 0,
+    clutter: float = 0.0,
+    yaw: float = 0.0,
+    mismatch: bool = False,
+    markings: bool = False,
+    lane_change: bool = False,
 ) -> Scene:
     """A random night road of the model's prior.
 
@@ -48,13 +55,14 @@ def night_road(
     yaw       drift [rad]: each old detection of a vehicle is turned about the car by N(0, yaw)
     mismatch  the road is a line, a bend and clothoids between, not one clothoid
     markings  both borders of the lane are seen too, to 70 m
+    lane_change  one more car is seen, which goes over to the left lane within 60 m
 
     The truth holds `course` (6,) and `offset` (G,) as the model's sites do, and `line` (M, 3): x, y, heading of the
     course every half metre. Raises InputError for a negative seed and shares that are none."""
     _check("night_road", seed)
     if not 0 <= clutter <= 1 or not 0 <= yaw < np.inf:
         raise InputError(f"scenario night_road: clutter is {clutter} and yaw is {yaw}; give a share and an angle >= 0")
-    streams = np.random.SeedSequence(seed).spawn(6)
+    streams = np.random.SeedSequence(seed).spawn(7)
     where, layout = random_layout(np.random.default_rng(streams[0]))
     mean, tril = course_moments(MODEL.prior)
     rng = np.random.default_rng(streams[1])
@@ -72,10 +80,11 @@ def night_road(
     if markings:
         painted, rng = Layout([], [], [], []), np.random.default_rng(streams[5])
         place_markings(painted, rng)
-        more = see(painted, line, rng, streams[5].spawn(1)[0])
-        joined = Cues(*(np.concatenate(pair) for pair in zip(seen.cues, more.cues, strict=True)))  # type: ignore[arg-type]
-        seen = Seen(joined, seen.offset | more.offset)
+        seen = seen.join(see(painted, line, rng, streams[5].spawn(1)[0]))
+    if lane_change:
+        seen = seen.join(changing_car(line, len(seen.cues.kind), np.random.default_rng(streams[6])))
     info = {"place": where, "clutter": clutter, "yaw": yaw, "mismatch": mismatch, "markings": markings}
+    info["lane_change"] = lane_change
     return _scene("night_road", seed, seen, line, info)
 
 
@@ -133,6 +142,11 @@ class Seen(NamedTuple):
     cues: Cues
     offset: dict[str, float]
 
+    def join(self, more: Seen) -> Seen:
+        """Both together."""
+        joined = Cues(*(np.concatenate(pair) for pair in zip(self.cues, more.cues, strict=True)))  # type: ignore[arg-type]
+        return Seen(joined, self.offset | more.offset)
+
 
 def see(layout: Layout, line: Line, rng: np.random.Generator, noise: np.random.SeedSequence) -> Seen:
     """The cues of a layout along a line (`along`). Offsets are drawn from the priors of the kinds; the noise is that at
@@ -167,6 +181,20 @@ def camera(true: Floats, vehicles: NDArray[np.bool_]) -> Floats:
     distance = np.hypot(*true.T)
     range_std = 0.05 + np.where(vehicles, 0.05 * distance, 0.02 * distance + 0.0003 * distance**2)
     return line_of_sight(true, range_std, 0.02 + 0.002 * distance)
+
+
+def changing_car(line: Line, track: int, rng: np.random.Generator) -> Seen:
+    """A car that goes over to the lane on the left while it is seen."""
+    layout = Layout([], [], [], [])
+    for arc in rng.uniform(40.0, 60.0) + CHANGE_REACH / (HISTORY - 1) * np.arange(HISTORY):
+        layout.add("car", False, track, float(arc))
+    seen = see(layout, line, rng, np.random.SeedSequence(int(rng.integers(2**63))))
+    u = np.linspace(0.0, 1.0, HISTORY)
+    aside, slope = LANE_WIDTH * u**2 * (3.0 - 2.0 * u), LANE_WIDTH / CHANGE_REACH * 6.0 * u * (1.0 - u)
+    heading = line.at(np.array(layout.arc)).heading.numpy()
+    shift = aside[:, None] * np.stack([-np.sin(heading), np.cos(heading)], -1)
+    cues = seen.cues._replace(position=seen.cues.position + shift, flow=seen.cues.flow + np.arctan(slope))
+    return seen._replace(cues=cues)
 
 
 def turn_vehicles(cues: Cues, angle: Floats) -> Cues:

@@ -152,6 +152,22 @@ class RoadCourse:
         chart = Chart(*(partial(part, prior=self.prior) for part in (to_courses, to_numbers, log_volumes)))
         return Squares(loc, scale, sites, {"course": (6,), "offset": (num,)}, evaluate, 0.0, {"course": chart})
 
+    def follows(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> Floats:
+        """Probability (N,) of each cue to follow the road, the mean over draws of course (S, 6) and offset (S, G)."""
+        course, offset = (torch.from_numpy(np.ascontiguousarray(draws[site])) for site in ("course", "offset"))
+        assert evidence.cues is not None
+        return CuesAlongRoad(self, evidence, course, offset).whitened(evidence.cues)[..., 2].mean(0).numpy()
+
+    def remarks(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> list[str]:
+        """Vehicles of which two detections or more do not follow the road, in words: they change lanes or turn off."""
+        strays = self.follows(evidence, draws) < 0.5
+        return [
+            f"{evidence.names[g]} does not follow the road in {strays[evidence.group == g].sum()} of "
+            f"{(evidence.group == g).sum()} detections: it changes lanes or turns off, and these count for nothing"
+            for g in np.unique(evidence.group[evidence.moves])
+            if strays[evidence.group == g].sum() >= 2
+        ]
+
     def _kernel(self, evidence: RoadEvidence) -> tuple[Any, ...]:
         """What every kernel reads of the model and its evidence."""
         if evidence.cues is None:

@@ -10,6 +10,7 @@ All steps are taken with w at hand, so that one that moves a knot carries the ro
 transport reversible jump (Davies, Salomone, Sutton, Drovandi 2023):
 
     walk         w_j moves by U[-a, a] for one j; the log of a is uniform
+    scale        all of w by e^t, t ~ U[-a, a]:  |J| = e^(n t); it brings home chains that begin far away
     refresh      of the road's numbers: (w, xi) -> (r w + q xi, q w - r xi), r^2 + q^2 = 1, xi normal; r is 0 or R_NEAR
     shift        one knot moves by U[-a, a]; b' = m' + C'^-T w with the new m and C:  |J| = |C| / |C'|
     birth_death  a knot is born anywhere with one more w, normal; or a uniform one dies with its w. The born takes the
@@ -46,11 +47,11 @@ from models.road.segment_kernel import (
     views,
 )
 
-WALK, REFRESH, SHIFT, BIRTH_DEATH = range(4)
-NAMES = ("walk", "refresh", "shift", "birth_death")
-PROBABILITIES = (0.25, 0.25, 0.25, 0.25)
+WALK, SCALE, REFRESH, SHIFT, BIRTH_DEATH = range(5)
+NAMES = ("walk", "scale", "refresh", "shift", "birth_death")
+PROBABILITIES = (0.2, 0.1, 0.25, 0.25, 0.2)
 FITS = 2  # linearisations of a fit: about the reference road, then about what was found
-LARGEST_WALK, LARGEST_SHIFT = 3.0, 0.5  # standard deviations, share of the length
+LARGEST_WALK, LARGEST_SCALE, LARGEST_SHIFT = 3.0, 6.0, 0.5  # standard deviations, log of a factor, share of the length
 LOG_RANGE = 4.0  # steps are up to exp(-LOG_RANGE) shorter
 R_NEAR, SHARE_NEAR = 0.9, 0.5
 FAR = 7.0
@@ -229,6 +230,16 @@ def walk(u, u_new, factor, centre, size, w, z_new):  # type: ignore[no-untyped-d
 
 
 @nb.njit(error_model="numpy")
+def scale(u, u_new, factor, centre, size, w, z_new, log_q):  # type: ignore[no-untyped-def]
+    """Shrink or stretch all whitened numbers."""
+    t = LARGEST_SCALE * step_size(u[0]) * (2.0 * u[1] - 1.0)
+    for i in range(size):
+        w[i] *= math.exp(t)
+    u_new[1], log_q[2] = 1.0 - u[1], size * t
+    return colour(w, factor, centre, size, z_new)
+
+
+@nb.njit(error_model="numpy")
 def refresh(u, u_new, factor, centre, groups, size, w, z_new, log_q):  # type: ignore[no-untyped-def]
     """Mirror the road's whitened numbers and fresh normal ones in each other."""
     r = R_NEAR if u[0] < SHARE_NEAR else 0.0
@@ -270,6 +281,8 @@ def propose(kind, z, u, floats, ints, z_new, u_new, log_q):  # type: ignore[no-u
     whiten(z_new, factor, centre, size, w)
     if kind == WALK:
         return walk(u, u_new, factor, centre, size, w, z_new)
+    if kind == SCALE:
+        return scale(u, u_new, factor, centre, size, w, z_new, log_q)
     if kind == REFRESH:
         return refresh(u, u_new, factor, centre, groups, size, w, z_new, log_q)
     log_q[2] = log_det(factor, size)

@@ -16,10 +16,12 @@ from experiments.road_metrics import (
     RANGES,
     TUBES,
     at_ranges,
-    course_points,
-    drawn_courses,
+    drawn_roads,
+    estimated_road,
     half_width,
-    lateral_offsets,
+    has_road,
+    offsets_from,
+    road_points,
     trusted_range,
 )
 from experiments.scenarios.scene import Scene
@@ -44,8 +46,8 @@ OTHER = ("o", "#444c55")  # of a kind that a user added
 
 
 def figures(posterior: Posterior, scene: Scene) -> dict[str, Figure]:
-    """Nothing for a posterior without a road course."""
-    if "course" not in posterior.draws or not isinstance(scene.data, Cues):
+    """Nothing for a posterior without a road."""
+    if not has_road(posterior) or not isinstance(scene.data, Cues):
         return {}
     return {"road": road(posterior, scene)}
 
@@ -53,9 +55,9 @@ def figures(posterior: Posterior, scene: Scene) -> dict[str, Figure]:
 def road(posterior: Posterior, scene: Scene) -> Figure:
     """Above: cues with their measured covariances, the estimate with its 90 % band, the truth dashed. Below: how far
     each is to the left of the estimate, and the tubes. Beyond the calibrated range the estimate is dotted."""
-    courses, mean = drawn_courses(posterior), posterior.mean("course")
-    guess = course_points(mean)
-    left = -lateral_offsets(courses, guess)  # of the drawn courses
+    estimate = estimated_road(posterior)
+    guess = road_points(estimate)
+    left = -offsets_from(drawn_roads(posterior), guess)  # of the drawn roads
     low, high = np.quantile(left, BAND, axis=0)
     reach = trusted_range(-left)
     line = known(scene).get("line")
@@ -68,7 +70,7 @@ def road(posterior: Posterior, scene: Scene) -> Figure:
     above.set_title(_headline(scene, reach), loc="left", color=INK, fontsize=11)
     _draw_across(across, guess, (low, high), reach)
     if line is not None:
-        error = lateral_offsets(mean[None], at_ranges(line))[0]
+        error = offsets_from(estimate, at_ranges(line))[0]
         across.plot(guess[:, 0], error, ls=(0, (5, 3)), lw=1.1, color=TRUTH, label="true course")
     across.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
     return figure

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 
 from experiments.scenarios.scene import Scene
 from inference.posterior import Posterior
-from models.clothoid_kernel import BEND, COLUMNS, COS, LENGTH, SIN, X, Y, hermite_one, sample_one
+from models.clothoid_kernel import BEND, COLUMNS, COS, HEADING, LENGTH, SIN, X, Y, hermite_one, sample_one
 from models.road.cue_kernel import nearest_sample
+from models.road.segment_kernel import road_samples
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +40,8 @@ CUT = 0.8
 PRICE = 250.0  # of a false course [m]
 BAND = (0.05, 0.95)  # quantiles
 LEAST_RANGE = 40.0  # [m]
-SAMPLES = 41  # of a course, about four metres apart
+SAMPLES = 41  # of a road, about four metres apart
+LAID = 160.0  # of a road that has no end of its own [m]
 
 
 class RoadCheck(NamedTuple):
@@ -78,16 +80,65 @@ def half_width(tube: str) -> Floats:
     return near + growth * RANGES
 
 
+class Roads(NamedTuple):
+    """Samples of roads at equal steps of arc length, whatever model they are of.
+
+    table  (D, SAMPLES, 6): x, y, heading, its cosine and sine, curvature
+    step   (D,) [m], inf where there is no road
+    """
+
+    table: Floats
+    step: Floats
+
+
 def check_course(posterior: Posterior, line: Floats, num_draws: int = 400) -> RoadCheck:
-    """The posterior mean of `course` against a true line (M, 3), or (M, 2), that begins behind the car.
+    """The estimated road against a true line (M, 3), or (M, 2), that begins behind the car.
 
     num_draws  of the posterior that spread, coverage and range are counted from"""
-    courses, mean, truth = drawn_courses(posterior, num_draws), posterior.mean("course"), at_ranges(line)
-    error = lateral_offsets(mean[None], truth)[0]
-    offsets = lateral_offsets(courses, np.concatenate([truth, course_points(mean)]))
+    roads, estimate, truth = drawn_roads(posterior, num_draws), estimated_road(posterior, num_draws), at_ranges(line)
+    error = offsets_from(estimate, truth)[0]
+    offsets = offsets_from(roads, np.concatenate([truth, road_points(estimate)]))
     there, apart = np.split(offsets, 2, axis=1)
     low, high = np.quantile(there, BAND, axis=0)
     return RoadCheck(error, there.std(0), (low <= 0.0) & (high >= 0.0), trusted_range(apart))
+
+
+def has_road(posterior: Posterior) -> bool:
+    """Whether the draws are roads: of one clothoid by its ends (`course`), or of pieces (`knot_curvature`)."""
+    return "course" in posterior.draws or "knot_curvature" in posterior.draws
+
+
+def drawn_roads(posterior: Posterior, num_draws: int = 400) -> Roads:
+    """Equally weighted draws, at most `num_draws` of them."""
+    if "course" in posterior.draws:
+        return lay_courses(drawn_courses(posterior, num_draws))
+    return lay_draws(posterior.resample(num_draws, 0))
+
+
+def estimated_road(posterior: Posterior, num_draws: int = 400) -> Roads:
+    """One road: the mean of `course` where the draws have one; else the mean of drawn roads, sample by sample, for
+    numbers of roads with different knots have no mean that is a road."""
+    if "course" in posterior.draws:
+        return lay_courses(posterior.mean("course")[None])
+    roads = drawn_roads(posterior, num_draws)
+    table = roads.table.mean(0)
+    table[:, COS], table[:, SIN] = np.cos(table[:, HEADING]), np.sin(table[:, HEADING])
+    return Roads(table[None], roads.step[:1])
+
+
+def lay_courses(courses: Floats) -> Roads:
+    """Courses (D, 6), by their ends."""
+    roads = Roads(np.empty((len(courses), SAMPLES, COLUMNS)), np.empty(len(courses)))
+    clothoid = np.empty(6)
+    for d, course in enumerate(courses):
+        roads.step[d] = lay(course, clothoid, roads.table[d])
+    return roads
+
+
+def lay_draws(draws: dict[str, Floats]) -> Roads:
+    """Draws of models.road.segments.SegmentedRoad, {site: (D, *event)}, laid to LAID."""
+    table = road_samples(draws, LAID, SAMPLES)
+    return Roads(table, np.full(len(table), LAID / (SAMPLES - 1)))
 
 
 def drawn_courses(posterior: Posterior, num_draws: int = 400) -> Floats:
@@ -111,11 +162,14 @@ def at_ranges(line: Floats) -> Floats:
     return np.stack([np.interp(RANGES, distance, line[:, axis]) for axis in range(2)], -1)
 
 
+def road_points(road: Roads) -> Floats:
+    """Points (R, 2) of the first of roads at RANGES."""
+    return at_ranges(road.table[0][:, [X, Y]])
+
+
 def course_points(course: Floats) -> Floats:
     """Points (R, 2) of a course (6,) at RANGES."""
-    clothoid, table = np.empty(6), np.empty((SAMPLES, COLUMNS))
-    lay(course, clothoid, table)
-    return at_ranges(table[:, [X, Y]])
+    return road_points(lay_courses(course[None]))
 
 
 @nb.njit(cache=True)
@@ -125,14 +179,25 @@ def lay(course: Floats, clothoid: Floats, table: Floats) -> float:
     return sample_one(clothoid, table) if clothoid[LENGTH] < np.inf else np.inf
 
 
-@nb.njit(cache=True)
 def lateral_offsets(courses: Floats, points: Floats) -> Floats:
-    """How far left of courses (D, 6) points (R, 2) are, (D, R) [m]; inf where no clothoid joins the ends.
+    """How far left of courses (D, 6) points (R, 2) are, (D, R) [m]; inf where no clothoid joins the ends."""
+    return offsets_from(lay_courses(courses), points)
 
-    The parabola through the nearest sample stands for the course: exact to .1 mm on any road of the prior."""
-    out, clothoid, table = np.empty((len(courses), len(points))), np.empty(6), np.empty((SAMPLES, COLUMNS))
-    for d in range(len(courses)):
-        step = lay(courses[d], clothoid, table)
+
+def offsets_from(roads: Roads, points: Floats) -> Floats:
+    """How far left of roads points (R, 2) are, (D, R) [m]; inf where there is no road.
+
+    The parabola through the nearest sample stands for the road: exact to .1 mm on any road of the prior."""
+    out = np.empty((len(roads.table), len(points)))
+    lateral(roads.table, roads.step, points, out)  # type: ignore[call-arg]
+    return out
+
+
+@nb.njit(cache=True)
+def lateral(tables: Floats, steps: Floats, points: Floats, out: Floats) -> None:
+    """`offsets_from` into out (D, R)."""
+    for d in range(len(tables)):
+        table, step = tables[d], steps[d]
         for r in range(len(points)):
             if step == np.inf:
                 out[d, r] = np.inf
@@ -141,11 +206,10 @@ def lateral_offsets(courses: Floats, points: Floats) -> Floats:
             dx, dy = points[r, 0] - table[k, X], points[r, 1] - table[k, Y]
             along, across = dx * table[k, COS] + dy * table[k, SIN], dy * table[k, COS] - dx * table[k, SIN]
             out[d, r] = across - 0.5 * table[k, BEND] * along**2
-    return out
 
 
 def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
-    """`check_course` of a posterior with a site `course`, for the report; nothing without a true line.
+    """`check_course` of a posterior of roads, for the report; nothing without a true line.
 
     error_40_m ..       distance of the true course from the estimate at 40, 80 and 140 m
     spread_40_m ..      its posterior standard deviation
@@ -154,7 +218,7 @@ def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
     range_m             calibrated range, 0 where even the first metres are not trusted
     trusted_true        1 where the estimate is inside the mid tube up to there, 0 where not, nan for an abstention
     coverage            share of the ranges where the 90 % band holds the truth"""
-    if scene.truth is None or "course" not in posterior.draws:
+    if scene.truth is None or not has_road(posterior):
         return {}
     found = check_course(posterior, scene.truth["line"])
     out: dict[str, float] = {}
@@ -165,3 +229,15 @@ def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
     out |= {f"inside_{tube}": float(found.inside(tube)) for tube in TUBES}
     right = {"true": 1.0, "false": 0.0, "none": math.nan}[found.outcome]
     return out | {"range_m": found.reach, "trusted_true": right, "coverage": float(found.covered.mean())}
+
+
+def label_free(posterior: Posterior) -> dict[str, Floats]:
+    """Where the drawn roads are, across the estimated one at 40, 80 and 140 m, for the diagnostics of roads of pieces:
+    knots have no order. (chain, draw) each [m]; nothing for draws that are no roads."""
+    if not has_road(posterior):
+        return {}
+    num = int(np.prod(posterior.shape))
+    flat = {site: values.reshape(num, *values.shape[2:]) for site, values in posterior.draws.items()}
+    roads = lay_courses(flat["course"]) if "course" in flat else lay_draws(flat)
+    left = -offsets_from(roads, road_points(estimated_road(posterior)))
+    return {f"left_{r:.0f}_m": left[:, RANGES == r].reshape(posterior.shape) for r in TOLD}

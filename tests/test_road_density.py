@@ -24,7 +24,7 @@ from models.road.numbers import log_volumes, number_moments, to_courses, to_numb
 from models.road.prior import course_moments
 
 Floats = NDArray[np.float64]
-EXACT, PURE = RoadCourse(clutter=0.1), RoadCourse(clutter=0.0)
+EXACT, PURE = RoadCourse(clutter=0.1, lane_changes=0.2), RoadCourse(clutter=0.0, lane_changes=0.0)
 PAPER = RoadCourse(likelihood="paper", beta_static=0.7, beta_vehicle=1.3, beta_flow=0.4)
 MODELS = pytest.mark.parametrize("model", [EXACT, PURE, PAPER], ids=["exact", "pure", "paper"])
 SCENE = night_road(2)
@@ -73,10 +73,24 @@ def written_down(model: RoadCourse, evidence: RoadEvidence, x: Tensor) -> Tensor
     gap = turn - theta - bend * along
     gap = gap - 2 * math.pi * torch.round(gap / (2 * math.pi))
     follows = place + torch.where(seen, normal(gap, flow_std), 0.0) + in_sight(model, evidence, angle, length, foot)
-    if model.clutter == 0:
-        return follows.sum(-1)
-    stray = math.log(model.clutter / model.clutter_width) - seen.double() * math.log(2 * math.pi)
-    return torch.logaddexp(follows + math.log(1 - model.clutter), stray.expand_as(follows)).sum(-1)
+    if model.clutter > 0:
+        stray = math.log(model.clutter / model.clutter_width) - seen.double() * math.log(2 * math.pi)
+        single = torch.logaddexp(follows + math.log(1 - model.clutter), stray.expand_as(follows))
+    else:
+        single = follows
+    there = normal(foot, (variance + model.change_std**2).sqrt())
+    there = there + torch.where(seen, normal(gap, torch.hypot(flow_std, torch.tensor(model.change_turn))), 0.0)
+    wide = evidence._replace(spread=np.hypot(evidence.spread, model.change_std))
+    there = there + in_sight(model, wide, angle, length, foot)
+    total = torch.zeros(len(x), dtype=torch.float64)
+    for g in range(len(evidence.names)):
+        mine = torch.from_numpy(evidence.group == g)
+        stays = single[:, mine].sum(-1)
+        if evidence.moves[evidence.group == g][0] and model.lane_changes > 0:
+            leaves = math.log(model.lane_changes) + there[:, mine].sum(-1)
+            stays = torch.logaddexp(math.log(1.0 - model.lane_changes) + stays, leaves)
+        total = total + stays
+    return total
 
 
 def in_sight(model: RoadCourse, evidence: RoadEvidence, angle: Tensor, length: Tensor, lateral: Tensor) -> Tensor:
@@ -262,8 +276,10 @@ def test_residuals_are_white_at_the_truth_and_weights_count_the_clutter() -> Non
         road = CuesAlongRoad(model, blank, draw["course"], draw["offset"])
         lateral, turn, weight = road.whitened(draw["cues"]).numpy().transpose(2, 0, 1)
         if model is EXACT:
-            share, cells = 1.0 - EXACT.clutter, weight.size
-            assert abs(weight.mean() - share) < 4 * math.sqrt(share * (1 - share) / cells) + 1e-3
+            stays = np.where(EVIDENCE.moves, 1.0 - EXACT.lane_changes, 1.0)
+            share = float((1.0 - EXACT.clutter) * stays.mean())
+            together = (weight.mean(1)).std() / math.sqrt(num)  # all cues of a vehicle change lanes at once
+            assert abs(weight.mean() - share) < 4 * together + 1e-3
             continue
         for residual in (lateral, turn[:, measured]):
             assert np.all(np.abs(residual.mean(0)) < 4 / math.sqrt(num))

@@ -34,7 +34,7 @@ from models.road.cues import Cues, line_of_sight
 from models.road.prior import course_moments
 
 Floats = NDArray[np.float64]
-MODEL = RoadCourse(clutter=0.0)
+MODEL = RoadCourse(clutter=0.0, lane_changes=0.0)
 LINE_STEP = 0.5  # of the true line [m]
 CLUTTER_REACH = 15.0  # to either side [m]
 LANE_WIDTH, CHANGE_REACH = 3.5, 60.0  # how far a change of lanes leads aside, and along the road [m]

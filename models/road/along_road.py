@@ -85,6 +85,13 @@ def scatter(points: Points, offset: Tensor, evidence: RoadEvidence, model: RoadC
     measured = np.isfinite(evidence.flow_spread)
     flow_std = torch.from_numpy(np.hypot(np.where(measured, evidence.flow_spread, 0.0), evidence.flow_std))
     away = torch.where(is_clutter, clutter[..., 2] * 2.0 * math.pi, flow_std * noise[..., 3])
+    if model.lane_changes > 0:
+        group, more = torch.from_numpy(evidence.group), torch.randn((*offset.shape, 2), dtype=torch.float64)
+        chance = torch.rand((*offset.shape[:-1], len(evidence.names)), dtype=torch.float64)[..., group]
+        leaves = torch.from_numpy(evidence.moves) & (chance < model.lane_changes)
+        spread, there = torch.from_numpy(evidence.spread), (model.change_std, model.change_turn)
+        aside = torch.where(leaves, spread * noise[..., 0] + there[0] * more[..., 0], aside)
+        away = torch.where(leaves, flow_std * noise[..., 3] + there[1] * more[..., 1], away)
     direction = points.heading + torch.from_numpy(evidence.turn) + away
     x = points.x - torch.sin(points.heading) * (offset + aside) + blur[..., 0]
     y = points.y + torch.cos(points.heading) * (offset + aside) + blur[..., 1]
@@ -100,21 +107,31 @@ def cue_arrays(model: RoadCourse, evidence: RoadEvidence, cues: Floats) -> tuple
     """What the kernels read of cues (N, 3): rows (N, WIDTH) of models.road.cue_kernel, groups (N,)."""
     paper = model.likelihood == "paper"
     position = np.where(evidence.moves, model.beta_vehicle, model.beta_static) if paper else 1.0
-    precision = math.sqrt(model.beta_flow) / evidence.flow_spread
-    if not paper:
-        precision = 1.0 / np.hypot(evidence.flow_spread, evidence.flow_std)
+    deviation = evidence.flow_spread if paper else np.hypot(evidence.flow_spread, evidence.flow_std)
+    precision = (math.sqrt(model.beta_flow) if paper else 1.0) / deviation
     measured = precision > 0
-    rows = np.empty((len(cues), WIDTH))
+    rows = np.zeros((len(cues), WIDTH))
     rows[:, :3] = cues
     rows[:, 3], rows[:, 4], rows[:, 5] = (evidence.covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     rows[:, 6], rows[:, 7], rows[:, 8] = evidence.spread**2 / position, precision, evidence.turn
-    constant = np.where(measured, np.log(np.where(measured, precision, 1.0)) - 0.5 * math.log(2 * math.pi), 0.0)
-    rows[:, 9], rows[:, 10] = constant - 0.5 * math.log(2 * math.pi), 0.0
-    if not paper and model.clutter > 0:
+    rows[:, 9] = _log_constant(precision, measured)
+    rows[:, 11] = math.inf
+    if paper:
+        return rows, evidence.group
+    if model.clutter > 0:
         rows[:, 9] += math.log1p(-model.clutter)
         rows[:, 10] = model.clutter / model.clutter_width / np.where(measured, 2 * math.pi, 1.0)
-    rows[:, 11], rows[:, 12] = math.inf if paper else model.prior.behind + model.reach, model.reach_std**2
+    rows[:, 11], rows[:, 12] = model.prior.behind + model.reach, model.reach_std**2
+    rows[:, 13], rows[:, 14] = model.lane_changes * evidence.moves, rows[:, 6] + model.change_std**2
+    rows[:, 15] = 1.0 / np.hypot(deviation, model.change_turn)
+    rows[:, 16] = _log_constant(rows[:, 15], measured)
     return rows, evidence.group
+
+
+def _log_constant(precision: Floats, measured: NDArray[np.bool_]) -> Floats:
+    """Logarithms of what normalises the normal densities of a cue, but for the variance across."""
+    flow = np.where(measured, np.log(np.where(measured, precision, 1.0)) - 0.5 * math.log(2 * math.pi), 0.0)
+    return np.asarray(flow - 0.5 * math.log(2 * math.pi))
 
 
 class _LogProb(torch.autograd.Function):

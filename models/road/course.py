@@ -36,7 +36,7 @@ from scipy.special import ndtri
 from models.capability import Chart, Factors, Squares
 from models.program import InputError
 from models.road.along_road import CuesAlongRoad, cue_arrays, kernel_settings
-from models.road.cue_kernel import SPREAD
+from models.road.cue_kernel import SPREADS
 from models.road.cues import KINDS, CueKind, Cues
 from models.road.evidence import RoadEvidence, road_evidence
 from models.road.kernel import density_slopes, group_densities, normal_equations
@@ -57,6 +57,9 @@ class RoadCourse:
     clutter_width: float = 30.0  # across the road, where clutter is [m]
     reach: float = 125.0  # of the camera along the road: half the cues there are seen; inf for no end [m]; of `exact`
     reach_std: float = 14.0  # over which it ends [m]
+    lane_changes: float = 0.05  # share of vehicles that change lanes while they are seen; of `exact`
+    change_std: float = 2.0  # how far aside their detections are then [m]
+    change_turn: float = 0.1  # and how much they turn [rad]
     beta_static: float = 1.0  # weights of the paper's likelihood
     beta_vehicle: float = 1.0
     beta_flow: float = 1.0
@@ -69,9 +72,20 @@ class RoadCourse:
             raise InputError(f"likelihood is '{self.likelihood}'; choose 'exact' or 'paper'")
         if not 0 <= self.clutter < 1:
             raise InputError(f"clutter is {self.clutter}; give a share in [0, 1)")
+        if not 0 <= self.lane_changes < 1:
+            raise InputError(f"lane_changes is {self.lane_changes}; give a share in [0, 1)")
         if not self.reach > 0:
             raise InputError(f"reach is {self.reach}; give the metres that the camera sees, or inf")
-        for name in ("clutter_width", "reach_std", "beta_static", "beta_vehicle", "beta_flow", "spacing"):
+        for name in (
+            "clutter_width",
+            "reach_std",
+            "change_std",
+            "change_turn",
+            "beta_static",
+            "beta_vehicle",
+            "beta_flow",
+            "spacing",
+        ):
             value = getattr(self, name)
             if not math.isfinite(value) or value <= 0:
                 raise InputError(f"{name} must be finite and positive, but is {value}")
@@ -101,15 +115,15 @@ class RoadCourse:
         loc, std = evidence.offset_loc, evidence.offset_std
         course, num, paper, cues, group = self._kernel(evidence)
         centre, scale = np.r_[np.zeros(6), loc], np.r_[np.ones(6), std]
-        roads, sharp = first_roads(self.prior), cues[:, SPREAD].copy()
+        roads, sharp = first_roads(self.prior), cues[:, SPREADS].copy()
         x = np.concatenate([roads, np.zeros((len(roads), len(loc)))], 1)
-        cues[:, SPREAD] = sharp + FOGS[0] ** 2
+        cues[:, SPREADS] = sharp + FOGS[0] ** 2
         heights = np.empty((len(x), 1 + len(loc)))
         group_densities(x, course, num, paper, cues, group, loc, std, heights)  # type: ignore[call-arg]
         best = x[np.argmax(heights[:, 1:].sum(-1))]
         hessian, gradient = np.zeros((len(best), len(best))), np.empty(len(best))
         for fog in FOGS:
-            cues[:, SPREAD] = sharp + fog**2
+            cues[:, SPREADS] = sharp + fog**2
             normal_equations(centre + scale * best, course, num, paper, cues, group, hessian, gradient)  # type: ignore[call-arg]
             whole = np.eye(len(best)) + scale[:, None] * hessian * scale
             best = best - dposv(whole, best + scale * gradient, lower=1)[1]
@@ -159,13 +173,14 @@ class RoadCourse:
         return CuesAlongRoad(self, evidence, course, offset).whitened(evidence.cues)[..., 2].mean(0).numpy()
 
     def remarks(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> list[str]:
-        """Vehicles of which two detections or more do not follow the road, in words: they change lanes or turn off."""
-        strays = self.follows(evidence, draws) < 0.5
+        """Vehicles that rather change lanes, or turn off, than follow the road, in words."""
+        follows = self.follows(evidence, draws)
+        shares = {int(g): follows[evidence.group == g].mean() for g in np.unique(evidence.group[evidence.moves])}
         return [
-            f"{evidence.names[g]} does not follow the road in {strays[evidence.group == g].sum()} of "
-            f"{(evidence.group == g).sum()} detections: it changes lanes or turns off, and these count for nothing"
-            for g in np.unique(evidence.group[evidence.moves])
-            if strays[evidence.group == g].sum() >= 2
+            f"{evidence.names[g]} follows the road with a probability of only {share:.2f}: it changes lanes or turns "
+            "off, and counts for little"
+            for g, share in shares.items()
+            if share < 0.5
         ]
 
     def _kernel(self, evidence: RoadEvidence) -> tuple[Any, ...]:

@@ -20,6 +20,12 @@ a standard deviation at 140 m. Clutter is anything that does not follow the road
 vehicle changing lanes. In a bend, noise along the road moves cues across it by the order of k Sigma: less than a tenth
 of a standard deviation, and no correction of that order that was tried made slopes at the truth less biased.
 
+A vehicle v that changes lanes (probability c, all its detections together) is farther aside and turned,
+
+    p_v      = (1 - c) prod_n p_n + c prod_n N(lateral_n; 0, variance_n + change_std^2) N(turn_n; 0, flow^2 + ..)
+
+for single detections tell too little of it, and its last ones would bend the road (`score_groups`).
+
 `paper`, [T17] eq. 4 and 5: the error is the distance from the predicted point on the normal of the sample, and one less
 the correlation of the directions; both normal with variance sigma^2 / beta. There is no clutter and no end of sight.
 
@@ -33,21 +39,27 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
 
 from models.clothoid_kernel import ARC, BEND, COS, HEADING, SIN, X, Y
 from models.intersection.wrap import wrap
 
 # columns of a cue
 PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER, REACH, BLUR = range(13)
-WIDTH = 13  # SPREAD and BLUR (reach_std^2) are variances [m^2], PRECISION 1 / std [1/rad], CONSTANT a log density,
+# SPREAD and BLUR (reach_std^2) are variances [m^2], PRECISION 1 / std [1/rad], CONSTANT a log density,
 # CLUTTER a density or 0, REACH [m] from the start of the course, inf for no end of the sight
+CHANGES, SPREAD_THERE, PRECISION_THERE, CONSTANT_THERE = range(
+    13, 17
+)  # of a vehicle that changes lanes, and how likely
+WIDTH = 17
+SPREADS = [SPREAD, SPREAD_THERE]  # what fog adds to
 RESIDUALS, LOCAL = (
     4,
     7,
 )  # of a cue, at most; a residual and its slopes in along, across, heading, curvature, offset, arc
 ROOT_HALF = math.sqrt(0.5)
 LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
-FAR_INSIDE = 6.0  # standard deviations of sight from where log Phi is flat
+FAR_INSIDE = 8.0  # standard deviations of sight from where log Phi is flat
 
 
 @nb.njit(error_model="numpy")
@@ -71,31 +83,37 @@ def nearest_sample(cues, n, table, step):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
-def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
-    """(log density, weight) of cue n about sample k; residuals and slopes into rows (RESIDUALS, LOCAL), if any."""
+def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-untyped-def]
+    """(log density, weight) of cue n about sample k; residuals and slopes into rows (RESIDUALS, LOCAL), if any.
+
+    changes  whether it is of a vehicle that changes lanes: it may be farther aside, and is no clutter"""
+    spread, precision, constant, clutter = cues[n, SPREAD], cues[n, PRECISION], cues[n, CONSTANT], cues[n, CLUTTER]
+    if changes:
+        spread, precision, clutter = cues[n, SPREAD_THERE], cues[n, PRECISION_THERE], 0.0
+        constant = cues[n, CONSTANT_THERE]
     c, s, bend = table[k, COS], table[k, SIN], table[k, BEND]
     dx, dy = cues[n, PX] - table[k, X], cues[n, PY] - table[k, Y]
     along, across = dx * c + dy * s, dy * c - dx * s
     q = bend * along
     mx, my, norm = -s - c * q, c - s * q, 1.0 / (1.0 + q * q)
     sx, sy = cues[n, SXX] * mx + cues[n, SXY] * my, cues[n, SXY] * mx + cues[n, SYY] * my
-    variance = cues[n, SPREAD] + norm * (mx * sx + my * sy)
+    variance = spread + norm * (mx * sx + my * sy)
     lateral = across - 0.5 * q * along - offset
     root = 1.0 / math.sqrt(variance)
     e = lateral * root
-    turn = wrap(cues[n, FLOW] - table[k, HEADING] - q - cues[n, TURN]) * cues[n, PRECISION]
-    log_road, weight = cues[n, CONSTANT] - 0.5 * (e * e + turn * turn), 1.0
+    turn = wrap(cues[n, FLOW] - table[k, HEADING] - q - cues[n, TURN]) * precision
+    log_road, weight = constant - 0.5 * (e * e + turn * turn), 1.0
     skew = norm * (my * sx - mx * sy)  # t' Sigma m
     slant, blur, sight = skew / variance, 1.0, math.inf
     if cues[n, REACH] < math.inf:
-        blur = math.sqrt(cues[n, BLUR] + cues[n, SXX] + cues[n, SYY] - (variance - cues[n, SPREAD]) - slant * skew)
+        blur = math.sqrt(cues[n, BLUR] + cues[n, SXX] + cues[n, SYY] - (variance - spread) - slant * skew)
         sight = (cues[n, REACH] - table[k, ARC] - along + slant * lateral) / blur
     if sight < FAR_INSIDE:
         log_road += log_normal_share(sight)
-    if cues[n, CLUTTER] > 0.0:
+    if clutter > 0.0:
         road = root * math.exp(log_road)
-        weight = road / (road + cues[n, CLUTTER])
-        log_density = math.log(road + cues[n, CLUTTER])
+        weight = road / (road + clutter)
+        log_density = math.log(road + clutter)
     else:
         log_density = log_road + math.log(root)
     if len(rows) == 0:
@@ -106,12 +124,12 @@ def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
     rows[0, 4], rows[0, 5] = -0.5 * along * along * root, -root
     rows[1, 0], rows[1, 1], rows[1, 3] = (1.0 - e * e) * ROOT_HALF, swing * norm * bend, swing
     rows[1, 4] = swing * norm * along
-    rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * cues[n, PRECISION], -cues[n, PRECISION]
-    rows[2, 4] = -along * cues[n, PRECISION]
+    rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * precision, -precision
+    rows[2, 4] = -along * precision
     if sight < FAR_INSIDE:
         inverse_mills = math.exp(-0.5 * sight * sight - LOG_ROOT - log_normal_share(sight))
         pull = math.sqrt(inverse_mills * (sight + inverse_mills))  # of the curvature of log Phi
-        unlike = 2.0 * (variance - cues[n, SPREAD]) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
+        unlike = 2.0 * (variance - spread) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
         slant_turn = (unlike + 2.0 * slant * skew) / variance  # d slant / d heading
         blur_turn = 2.0 * (skew - slant * unlike - slant * slant * skew)  # d blur^2 / d heading
         by_turn = (slant_turn * lateral - 0.5 * sight * blur_turn / blur) / blur
@@ -126,7 +144,7 @@ def exact_cue(cues, n, offset, table, k, rows):  # type: ignore[no-untyped-def]
 @nb.njit(error_model="numpy")
 def log_normal_share(x):  # type: ignore[no-untyped-def]
     """log Phi(x)."""
-    if x > -6.0:
+    if x > -30.0:  # past that erfc underflows
         return math.log(0.5 * math.erfc(-x * ROOT_HALF))
     y = 1.0 / (x * x)
     return -0.5 * x * x - math.log(-x) - LOG_ROOT + math.log1p(-y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y))))
@@ -156,4 +174,33 @@ def score_cue(paper, cues, n, offset, table, k, rows):  # type: ignore[no-untype
     """(log density, weight) and rows of one or the other."""
     if paper:
         return paper_cue(cues, n, offset, table, k, rows)
-    return exact_cue(cues, n, offset, table, k, rows)
+    return exact_cue(cues, n, offset, table, k, False, rows)
+
+
+@nb.njit(error_model="numpy")
+def find_samples(cues, table, step, near):  # type: ignore[no-untyped-def]
+    """The nearest sample of every cue, near (N,)."""
+    for n in range(len(cues)):
+        near[n] = nearest_sample(cues, n, table, step)
+
+
+@nb.njit(error_model="numpy")
+def score_groups(paper, cues, group, near, offset, table, out, changes):  # type: ignore[no-untyped-def]
+    """Log densities of groups, out (G,), at offsets (G,) [m], and the probability of each to change lanes, (G,).
+
+    near  (N,) the sample of the table that each cue is scored about"""
+    rows, there = np.empty((0, LOCAL)), np.zeros(len(offset))
+    out[:] = 0.0
+    changes[:] = 0.0
+    for n in range(len(cues)):
+        g, k = group[n], near[n]
+        out[g] += score_cue(paper, cues, n, offset[g], table, k, rows)[0]
+        if cues[n, CHANGES] > 0.0:
+            changes[g] = cues[n, CHANGES]
+            there[g] += exact_cue(cues, n, offset[g], table, k, True, rows)[0]
+    for g in range(len(offset)):
+        if changes[g] > 0.0:
+            stays, leaves = math.log1p(-changes[g]) + out[g], math.log(changes[g]) + there[g]
+            most = max(stays, leaves)
+            out[g] = most + math.log(math.exp(stays - most) + math.exp(leaves - most))
+            changes[g] = math.exp(leaves - out[g])

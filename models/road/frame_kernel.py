@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from models.clothoid_kernel import COLUMNS, CURVATURE, HEADING, LENGTH, RATE, X, Y, sample_one
-from models.road.cue_kernel import LOCAL, nearest_sample, score_cue
+from models.road.cue_kernel import find_samples, score_groups
 from models.road.kernel import linearise
 
 ROAD = 4  # numbers of the clothoid in z
@@ -29,13 +29,13 @@ def frame_densities(z, begin, length, num, paper, cues, group, out):  # type: ig
     """Log density of all cues, out (S,), at numbers z (S, 4 + G).
 
     begin, length  of the clothoid [m], num of its samples; paper, cues and group as in models.road.kernel"""
-    clothoid, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((0, LOCAL))
+    clothoid, table, near = np.empty(6), np.empty((num, COLUMNS)), np.empty(len(cues), np.int64)
+    groups = z.shape[1] - ROAD
+    height, changes = np.empty(groups), np.empty(groups)
     for i in range(len(z)):
-        step = lay_road(z[i], begin, length, clothoid, table)
-        out[i] = 0.0
-        for n in range(len(cues)):
-            k = nearest_sample(cues, n, table, step)
-            out[i] += score_cue(paper, cues, n, z[i, ROAD + group[n]], table, k, rows)[0]
+        find_samples(cues, table, lay_road(z[i], begin, length, clothoid, table), near)
+        score_groups(paper, cues, group, near, z[i, ROAD:], table, height, changes)
+        out[i] = height.sum()
 
 
 @nb.njit(cache=True, error_model="numpy")

@@ -40,7 +40,7 @@ from models.capability import Hyper
 from models.clothoid_kernel import COLUMNS, LENGTH, hermite_one, sample_one
 from models.program import InputError
 from models.road.along_road import cue_arrays
-from models.road.cue_kernel import LOCAL, nearest_sample, score_cue
+from models.road.cue_kernel import nearest_sample, score_groups
 from models.road.cues import KINDS, CueKind, Cues
 from models.road.prior import course_moments
 
@@ -271,7 +271,7 @@ def near_samples(courses, num, cues, out):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, error_model="numpy")
 def score_draws(paper, cues, group, offset, nearest, out):  # type: ignore[no-untyped-def]
     """Adds the log density of all cues (N, WIDTH) at offsets (n, G) [m] and samples (n, N, COLUMNS) to out (n,)."""
-    rows = np.empty((0, LOCAL))
+    near, height, changes = np.arange(len(cues)), np.empty(offset.shape[1]), np.empty(offset.shape[1])
     for s in range(len(offset)):
-        for n in range(len(cues)):
-            out[s] += score_cue(paper, cues, n, offset[s, group[n]], nearest[s], n, rows)[0]
+        score_groups(paper, cues, group, near, offset[s], nearest[s], height, changes)
+        out[s] += height.sum()

@@ -15,7 +15,7 @@ import numpy as np
 
 from models.clothoid_kernel import COLUMNS, COS, LENGTH, SIN, hermite_one, sample_one
 from models.road.course_slopes import hermite_slopes, moments, sample_row
-from models.road.cue_kernel import LOCAL, LOG_ROOT, RESIDUALS, nearest_sample, score_cue
+from models.road.cue_kernel import LOCAL, LOG_ROOT, RESIDUALS, exact_cue, find_samples, score_cue, score_groups
 from models.road.numbers import affine, course_density
 
 NO_ROAD = -1e9  # [nats]
@@ -40,57 +40,67 @@ def group_densities(x, course, num, paper, cues, group, loc, std, out):  # type:
     paper   whether as printed
     cues    (N, WIDTH) as in models.road.cue_kernel, group (N,) of each
     loc, std  (G,) of the offsets"""
-    theta, table, rows = np.empty(6), np.empty((num, COLUMNS)), np.empty((0, LOCAL))
-    none, empty = np.empty(0), np.empty((0, 0))
+    theta, table, near = np.empty(6), np.empty((num, COLUMNS)), np.empty(len(cues), np.int64)
+    none, empty, offset, changes = np.empty(0), np.empty((0, 0)), np.empty(len(loc)), np.empty(len(loc))
     for i in range(len(x)):
         height = correction(x[i], *course, theta, none, empty)  # type: ignore[call-arg]
-        out[i] = 0.0 if height > -np.inf else NO_ROAD
         if height == -np.inf:
+            out[i] = NO_ROAD
             continue
+        for g in range(len(loc)):
+            offset[g] = loc[g] + std[g] * x[i, 6 + g]
+        find_samples(cues, table, sample_one(theta, table), near)
         out[i, 0] = height
-        step = sample_one(theta, table)
-        for n in range(len(cues)):
-            g, k = group[n], nearest_sample(cues, n, table, step)
-            offset = loc[g] + std[g] * x[i, 6 + g]
-            out[i, 1 + g] += score_cue(paper, cues, n, offset, table, k, rows)[0]
+        score_groups(paper, cues, group, near, offset, table, out[i, 1:], changes)
 
 
 @nb.njit(error_model="numpy")
 def linearise(theta, offset, num, paper, cues, group, gradient, hessian):  # type: ignore[no-untyped-def]
     """Log density of all cues beside the clothoid theta (6,) at offsets (G,) [m]; its gradient (6 + G,) in both and,
     unless empty, minus its expected second derivatives (6 + G, 6 + G), of which the lower half is filled."""
-    full = len(hessian) > 0
+    full, groups = len(hessian) > 0, len(offset)
     table, rows = np.empty((num, COLUMNS)), np.empty((RESIDUALS, LOCAL))
-    moment, row = np.empty((num, 4)), np.empty(6)
-    step, total = sample_one(theta, table), 0.0
+    moment, row, near = np.empty((num, 4)), np.empty(6), np.empty(len(cues), np.int64)
+    height, changes = np.empty(groups), np.empty(groups)
+    step = sample_one(theta, table)
     moments(table, step, moment)
+    find_samples(cues, table, step, near)
+    score_groups(paper, cues, group, near, offset, table, height, changes)
     gradient[:] = 0.0
     hessian[:] = 0.0
     for n in range(len(cues)):
-        k, o = nearest_sample(cues, n, table, step), 6 + group[n]
-        log_density, weight = score_cue(paper, cues, n, offset[group[n]], table, k, rows)
-        total += log_density
+        k, g = near[n], group[n]
         c, s = table[k, COS], table[k, SIN]
         dx, dy = cues[n, 0] - table[k, 0], cues[n, 1] - table[k, 1]
         along, across = dx * c + dy * s, dy * c - dx * s
-        share = k / (num - 1.0)
-        for r in range(RESIDUALS):
-            if rows[r, 1] == 0.0 and rows[r, 2] == 0.0 and rows[r, 3] == 0.0:  # says nothing
-                continue
-            residual, u, v, by_offset = rows[r, 0], rows[r, 1], rows[r, 2], rows[r, 5]
-            turn = rows[r, 3] + u * across - v * along
-            sample_row(v * s - u * c, -u * s - v * c, turn, rows[r, 4], k, theta, table, moment, row)
-            row[LENGTH] += rows[r, 6] * share
-            gradient[o] -= weight * residual * by_offset
-            for i in range(6):
-                gradient[i] -= weight * residual * row[i]
-            if full:
-                hessian[o, o] += weight * by_offset**2
-                for i in range(6):
-                    hessian[o, i] += weight * by_offset * row[i]
-                    for j in range(i + 1):
-                        hessian[i, j] += weight * row[i] * row[j]
-    return total
+        for leaves in range(2 if changes[g] > 0.0 else 1):
+            if leaves:
+                weight = changes[g] * exact_cue(cues, n, offset[g], table, k, True, rows)[1]
+            else:
+                weight = (1.0 - changes[g]) * score_cue(paper, cues, n, offset[g], table, k, rows)[1]
+            for r in range(RESIDUALS):
+                if rows[r, 1] == 0.0 and rows[r, 2] == 0.0 and rows[r, 3] == 0.0:  # says nothing
+                    continue
+                u, v = rows[r, 1], rows[r, 2]
+                turn = rows[r, 3] + u * across - v * along
+                sample_row(v * s - u * c, -u * s - v * c, turn, rows[r, 4], k, theta, table, moment, row)
+                row[LENGTH] += rows[r, 6] * k / (num - 1.0)
+                add_residual(weight, rows[r, 0], row, rows[r, 5], 6 + g, gradient, hessian, full)
+    return height.sum()
+
+
+@nb.njit(error_model="numpy")
+def add_residual(weight, residual, row, by_offset, o, gradient, hessian, full):  # type: ignore[no-untyped-def]
+    """One residual with slopes row (6,) in the course and `by_offset` in number o."""
+    gradient[o] -= weight * residual * by_offset
+    for i in range(6):
+        gradient[i] -= weight * residual * row[i]
+    if full:
+        hessian[o, o] += weight * by_offset**2
+        for i in range(6):
+            hessian[o, i] += weight * by_offset * row[i]
+            for j in range(i + 1):
+                hessian[i, j] += weight * row[i] * row[j]
 
 
 @nb.njit(error_model="numpy")
@@ -197,8 +207,11 @@ def explain(z, num, paper, cues, group, out):  # type: ignore[no-untyped-def]
     if theta[LENGTH] == np.inf:
         out[:] = np.nan
         return
-    step = sample_one(theta, table)
+    groups = len(z) - 6
+    near, height, changes = np.empty(len(cues), np.int64), np.empty(groups), np.empty(groups)
+    find_samples(cues, table, sample_one(theta, table), near)
+    score_groups(paper, cues, group, near, z[6:], table, height, changes)
     for n in range(len(cues)):
-        k = nearest_sample(cues, n, table, step)
-        out[n, 2] = score_cue(paper, cues, n, z[6 + group[n]], table, k, rows)[1]
+        weight = score_cue(paper, cues, n, z[6 + group[n]], table, near[n], rows)[1]
         out[n, 0], out[n, 1] = rows[1 if paper else 0, 0], rows[2, 0]
+        out[n, 2] = (1.0 - changes[group[n]]) * weight

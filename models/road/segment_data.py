@@ -20,7 +20,7 @@ from models.clothoid import hermite, sample
 from models.clothoid_kernel import COLUMNS
 from models.program import InputError
 from models.road.along_road import cue_arrays
-from models.road.cue_kernel import SPREAD, WIDTH
+from models.road.cue_kernel import SPREADS, WIDTH
 from models.road.evidence import RoadEvidence
 from models.road.segment_kernel import SHAPE, evaluate, samples_of
 from models.road.segment_moves import improve
@@ -43,7 +43,7 @@ class Bound(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """A road that fits begin at: offsets (G,) [m], samples (num, 6) of the road, and the step between them [m]."""
+    """A road that fits begin at: offsets (G,) [m], samples (num, 7) of the road, and the step between them [m]."""
 
     offset: Floats
     table: Floats
@@ -88,10 +88,10 @@ def bound_evidence(model: SegmentedRoad, evidence: RoadEvidence) -> Bound:
     if evidence.cues is None:
         raise InputError("this evidence has no cues (they await simulation); give them before inference")
     cues, group = cue_arrays(model.course, evidence, evidence.cues.numpy())
-    sharp, prior = cues[:, SPREAD].copy(), (evidence.offset_loc, evidence.offset_std)
+    sharp, prior = cues[:, SPREADS].copy(), (evidence.offset_loc, evidence.offset_std)
     at, z = first_road(model, evidence), even_state(model, prior[0], REFERENCE_KNOTS, REFERENCE_KNOTS)
     for fog in FOGS:
-        cues[:, SPREAD] = sharp + fog**2
+        cues[:, SPREADS] = sharp + fog**2
         if not improve(z, *bound(model, prior, REFERENCE_KNOTS, cues, group, at)):  # type: ignore[call-arg]
             raise FloatingPointError("the reference road of this evidence is not finite; check the cues' covariances")
         at = laid(model, z, len(prior[0]), REFERENCE_KNOTS)
@@ -117,7 +117,8 @@ def first_road(model: SegmentedRoad, evidence: RoadEvidence) -> Reference:
     start, end = (torch.from_numpy(part) for part in np.split(found["course"], 2))
     road, num = hermite(start, end), model.course.num_samples
     x, y, heading, curvature = (column.numpy() for column in sample(road, num))
-    table = np.column_stack([x, y, heading, np.cos(heading), np.sin(heading), curvature])
+    arc = np.linspace(0.0, float(road.length), num)
+    table = np.column_stack([x, y, heading, np.cos(heading), np.sin(heading), curvature, arc])
     return Reference(found["offset"], table, float(road.length) / (num - 1))
 
 

@@ -17,9 +17,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from models.clothoid_kernel import BEND, COLUMNS, COS, HEADING, SIN, X, Y
+from models.clothoid_kernel import ARC, BEND, COLUMNS, COS, HEADING, SIN, X, Y
 from models.intersection.window import window
-from models.road.cue_kernel import WIDTH, nearest_sample, score_cue
+from models.road.cue_kernel import WIDTH, find_samples, score_groups
 
 Floats = NDArray[np.float64]
 SHAPE = 5  # x, y, heading, curvature and rate
@@ -30,7 +30,7 @@ SLOTS, GROUPS, SAMPLES, CUES, PAPER, GROUP = range(6)  # of the ints; the last i
 @nb.njit
 def views(floats, ints):  # type: ignore[no-untyped-def]
     """Parts of the floats: log probabilities of the counts (K + 1,), mean and standard deviation (G + 5 + K,) of the
-    linear numbers, offsets (G,) and samples (num, 6) of the reference road, cues (N, WIDTH)."""
+    linear numbers, offsets (G,) and samples (num, 7) of the reference road, cues (N, WIDTH)."""
     slots, groups, num = ints[SLOTS], ints[GROUPS], ints[SAMPLES]
     size, o = groups + SHAPE + slots, COUNTS + slots + 1
     counts, loc, std = (
@@ -61,7 +61,7 @@ def sort_nodes(z, groups, slots, node, order):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def lay_pieces(z, groups, slots, length, table):  # type: ignore[no-untyped-def]
-    """Samples at equal steps of arc length from 0 to `length` [m] into table (num, 6), as those of
+    """Samples at equal steps of arc length from 0 to `length` [m] into table (num, 7), as those of
     models.clothoid_kernel.sample_one; returns the step [m].
 
     Directions are exact and positions by Simpson's rule, whose error where the rate changes by d within a step h is
@@ -88,18 +88,17 @@ def lay_pieces(z, groups, slots, length, table):  # type: ignore[no-untyped-def]
             y += step / 6.0 * (sin0 + 4.0 * sin1 + sin)
         cos0, sin0 = cos, sin
         table[k, X], table[k, Y], table[k, HEADING] = x, y, heading
-        table[k, COS], table[k, SIN], table[k, BEND] = cos, sin, node[1, i] + slope * beyond
+        table[k, COS], table[k, SIN], table[k, BEND], table[k, ARC] = cos, sin, node[1, i] + slope * beyond, s
     return step
 
 
 @nb.njit(error_model="numpy")
 def road_density(z, groups, slots, length, paper, cues, group, table):  # type: ignore[no-untyped-def]
     """Log density of all cues (N, WIDTH) beside the road of a state; `table` is room for its samples."""
-    step, total, rows = lay_pieces(z, groups, slots, length, table), 0.0, np.empty((0, 6))
-    for n in range(len(cues)):
-        k = nearest_sample(cues, n, table, step)
-        total += score_cue(paper, cues, n, z[1 + group[n]], table, k, rows)[0]
-    return total
+    near, height, changes = np.empty(len(cues), np.int64), np.empty(groups), np.empty(groups)
+    find_samples(cues, table, lay_pieces(z, groups, slots, length, table), near)
+    score_groups(paper, cues, group, near, z[1 : 1 + groups], table, height, changes)
+    return height.sum()
 
 
 @nb.njit(error_model="numpy")
@@ -140,13 +139,13 @@ def cue_densities(z, groups, slots, length, num, paper, cues, group, out):  # ty
 
 @nb.njit(cache=True, error_model="numpy")
 def lay_roads(z, groups, slots, length, tables):  # type: ignore[no-untyped-def]
-    """`lay_pieces` of states z (B, size) into tables (B, num, 6)."""
+    """`lay_pieces` of states z (B, size) into tables (B, num, 7)."""
     for i in range(len(z)):
         lay_pieces(z[i], groups, slots, length, tables[i])
 
 
 def samples_of(states: Floats, num_groups: int, slots: int, length: float, num: int) -> Floats:
-    """Samples (*B, num, 6) at equal steps from 0 to `length` [m] of states (*B, size), columns as in
+    """Samples (*B, num, 7) at equal steps from 0 to `length` [m] of states (*B, size), columns as in
     models.clothoid_kernel.sample_one."""
     rows = np.ascontiguousarray(states).reshape(-1, states.shape[-1])
     tables = np.empty((len(rows), num, COLUMNS))

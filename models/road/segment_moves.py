@@ -32,7 +32,7 @@ from models.intersection.moves import normal_cdf, normal_quantile, split_choice
 from models.intersection.refit import solve_spd
 from models.intersection.window import window
 from models.overwrite import overwrite
-from models.road.cue_kernel import nearest_sample, score_cue
+from models.road.cue_kernel import LOCAL, RESIDUALS, nearest_sample, score_cue
 from models.road.segment_kernel import (
     CUES,
     GROUP,
@@ -125,7 +125,7 @@ def linearise(z, floats, ints, table, step, offset, precision, centre):  # type:
             precision[i, j] = 0.0
         precision[i, i] = 1.0 / std[i] ** 2
         centre[i] = loc[i] / std[i] ** 2
-    rows, row = np.empty((3, 6)), np.empty(size + 1)
+    rows, row = np.empty((RESIDUALS, LOCAL)), np.empty(size + 1)
     for n in range(len(cues)):
         g, k = group[n], nearest_sample(cues, n, table, step)
         _, weight = score_cue(paper, cues, n, offset[g], table, k, rows)

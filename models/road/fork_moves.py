@@ -1,16 +1,18 @@
 """Steps over roads with one or two courses, in machine code; the batched path and the compiled chain call `propose`.
 
-What cues see of a road is where it is across itself, to centimetres near and decimetres far. So walks take their steps
-in metres across the road: along the main course by Legendre polynomials of the arc length, along the second by the
-polynomials v^2 and v^3 - 5/6 v^2 of its way v in [0, 1] from where it parts, which say different things of it. How
-narrow a posterior is is not known beforehand: a step draws its size first, from SMALLEST to 1 of the longest, evenly in
-its logarithm, and keeps it for the way back.
+What cues see of a road is where it is across itself, well near the car and ever less beyond. So walks take their steps
+in metres across the road, by polynomials of the arc length u in [0, 1] that are orthogonal under the weight (1 - u)^2:
+along the main course those of Jacobi, along the second v^2 and v^3 - 5/8 v^2 of its way v from where it parts. On
+simulated roads the posterior of their coefficients is a ball but for the first, which `shift` serves; by Legendre's
+polynomials, weight 1, the others correlate by .9. How narrow it is is not known beforehand: a step draws its size
+first, from SMALLEST to 1 of the longest, evenly in its logarithm, and keeps it for the way back.
 
     walk         the main course; half of the times the second goes along, half of the times it keeps its curvature
     shift        the main course to one side, all offsets to the other
     offset       of one group
     bend         the second course from where it parts
     slide        the place where they part, the end of the second where it was
+    swap         which of the two is the main one
     birth_death  of the second course; its numbers are exchanged for draws of their prior, whose levels go back in u'
     refresh      the same without birth or death: always taken while there is one course
 """
@@ -22,6 +24,7 @@ import math
 import numba as nb
 import numpy as np
 
+from models.clothoid_kernel import NODES, WEIGHTS
 from models.intersection.moves import normal_cdf, normal_quantile, split_choice
 from models.overwrite import overwrite
 from models.road.fork_kernel import (
@@ -39,26 +42,24 @@ from models.road.fork_kernel import (
     SHARED,
 )
 
-NAMES = ("walk", "shift", "offset", "bend", "slide", "birth_death", "refresh")
-PROBABILITIES = np.array([0.3, 0.1, 0.2, 0.15, 0.1, 0.13, 0.02])
-WALK, SHIFT, OFFSET, BEND, SLIDE, BIRTH_DEATH, REFRESH = range(len(NAMES))
-LONGEST = np.array([3.0, 4.0, 4.0, 8.0, 80.0, 0.0, 0.0])  # steps [m]
+NAMES = ("walk", "shift", "offset", "bend", "slide", "swap", "birth_death", "refresh")
+PROBABILITIES = np.array([0.21, 0.08, 0.18, 0.19, 0.19, 0.03, 0.1, 0.02])
+WALK, SHIFT, OFFSET, BEND, SLIDE, SWAP, BIRTH_DEATH, REFRESH = range(len(NAMES))
+LONGEST = np.array([1.5, 4.0, 4.0, 10.0, 100.0, 0.0, 0.0, 0.0])  # steps [m]
 SMALLEST = 0.03
 NUM_UNIFORMS = 6
-# values and derivatives at the start of the shifted Legendre polynomials 0 to 3
-LEGENDRE = np.array([[1.0, 0.0, 0.0, 0.0], [-1.0, 2.0, 0.0, 0.0], [1.0, -6.0, 12.0, 0.0], [-1.0, 12.0, -60.0, 120.0]])
+# values and derivatives at the start of the polynomials 0 to 3: P_n^(2, 0)(2 u - 1)
+JACOBI = np.array([[1.0, 0.0, 0.0, 0.0], [-1.0, 4.0, 0.0, 0.0], [1.0, -10.0, 30.0, 0.0], [-1.0, 18.0, -126.0, 336.0]])
 
 
 @nb.njit(error_model="numpy")
 def walk(z, u, longest, settings, z_new, u_new):  # type: ignore[no-untyped-def]
     """The main course across itself. u[:4] steps, u[4] their size, u[5] whether the second goes along."""
-    length = settings[LENGTH]
+    length, moved = settings[LENGTH], np.empty(4)
     for j in range(4):
-        step, scale = longest * (2.0 * u[j] - 1.0), 1.0
+        moved[j] = longest * (2.0 * u[j] - 1.0)
         u_new[j] = 1.0 - u[j]
-        for i in range(j + 1):
-            z_new[MAIN + i] += step * LEGENDRE[j, i] * scale
-            scale /= length
+    step_across(moved, length, z_new)
     if u[5] < 0.5 and z[COURSES] == 2.0:
         more, more_rate = z_new[MAIN + 2] - z[MAIN + 2], z_new[MAIN + 3] - z[MAIN + 3]
         if z[JOINS] == 1.0:
@@ -70,10 +71,10 @@ def walk(z, u, longest, settings, z_new, u_new):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def bend(z, u, longest, settings, z_new, u_new):  # type: ignore[no-untyped-def]
-    """The second course across itself. u[0], u[1] steps of v^2 and v^3 - 5/6 v^2."""
+    """The second course across itself. u[0], u[1] steps of v^2 and v^3 - 5/8 v^2."""
     way = settings[LENGTH] - z[SHARED]
     square, cube = longest * (2.0 * u[0] - 1.0), longest * (2.0 * u[1] - 1.0)
-    z_new[SECOND_BEND] += 2.0 * (square - 5.0 / 6.0 * cube) / way**2
+    z_new[SECOND_BEND] += 2.0 * (square - 5.0 / 8.0 * cube) / way**2
     z_new[SECOND_RATE] += 6.0 * cube / way**3
     u_new[0], u_new[1] = 1.0 - u[0], 1.0 - u[1]
 
@@ -98,6 +99,36 @@ def slide(z, u, longest, settings, z_new, u_new, log_q):  # type: ignore[no-unty
         log_q[2] = 4.0 * math.log(way / new_way)
     z_new[SECOND_BEND], z_new[SECOND_RATE] = 2.0 * a / new_way**2, 6.0 * b / new_way**3
     return True
+
+
+@nb.njit(error_model="numpy")
+def swap(z, settings, z_new):  # type: ignore[no-untyped-def]
+    """The second course for the main one. Let f(u) be how far across the main one it is: zero where both are one road,
+    so no polynomial. The main course moves by the nearest one, sum_j a_j P_j with
+
+        a_j = (2 j + 3) int_0^1 (1 - u)^2 P_j(u) f(u) du
+
+    and f changes its sign, which undoes itself: a_j is linear in the bends, and its Jacobian is 1."""
+    length, shared, joins = settings[LENGTH], z[SHARED], z[JOINS] == 1.0
+    way, moved = length - shared, np.zeros(4)
+    for i in range(len(NODES)):
+        v = way * NODES[i]  # from where they part
+        u = (way - v if joins else shared + v) / length
+        f = 0.5 * z[SECOND_BEND] * v**2 + z[SECOND_RATE] * v**3 / 6.0
+        weight = WEIGHTS[i] * way / length * (1.0 - u) ** 2 * (-f if joins else f)
+        for j in range(4):
+            value = JACOBI[j, 0] + u * (JACOBI[j, 1] + u * (JACOBI[j, 2] / 2.0 + u * JACOBI[j, 3] / 6.0))
+            moved[j] += (2 * j + 3) * weight * value
+    step_across(moved, length, z_new)
+    z_new[SECOND_BEND], z_new[SECOND_RATE] = -z[SECOND_BEND], -z[SECOND_RATE]
+
+
+@nb.njit(error_model="numpy")
+def step_across(moved, length, z_new):  # type: ignore[no-untyped-def]
+    """Move the main course by sum_j moved_j P_j [m]."""
+    for j in range(4):
+        for i in range(j + 1):
+            z_new[MAIN + i] += moved[j] * JACOBI[j, i] / length**i
 
 
 @nb.njit(error_model="numpy")
@@ -152,6 +183,9 @@ def propose(kind, z, u, floats, ints, z_new, u_new, log_q):  # type: ignore[no-u
         return True
     if z[COURSES] != 2.0:
         return False
+    if kind == SWAP:
+        swap(z, floats, z_new)
+        return True
     if kind == SLIDE:
         return slide(z, u, longest, floats, z_new, u_new, log_q)
     bend(z, u, longest, floats, z_new, u_new)

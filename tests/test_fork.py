@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from experiments.scenarios.road import night_road
-from models.capability import Move
-from models.clothoid import Clothoid, Points, evaluate
-from models.program import InputError, Latents, log_joint, simulate, terms
-from models.road.along_fork import CuesAlongFork, Fork, both_courses, sampled_courses, things_of
-from models.road.along_road import CuesAlongRoad
-from models.road.course import RoadCourse
-from models.road.evidence import RoadEvidence
-from models.road.fork import ForkedRoad, main_from
+from models.program import Latents, simulate
+from models.road.along_fork import Fork, both_courses, sampled_courses
+from models.road.fork import ForkedRoad
 from tests.involution import assert_involution, uniforms
 
 Floats = NDArray[np.float64]

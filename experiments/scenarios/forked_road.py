@@ -34,7 +34,7 @@ def forked_road(seed: int = 0, second: Literal["any", "none", "exit", "entry"] =
     second  what there is beside the motorway; "any" draws it
 
     The truth holds `num_courses`, `line` (M, 3) x, y, heading of the motorway, and where there is a second road also
-    `branch`, the same of it, `joins` and `place`, the arc length of the motorway where they part [m].
+    `branch`, the same of it, `joins` and `place`, how far ahead along the motorway they part [m].
     Raises InputError for a negative seed and for another word."""
     if seed < 0:
         raise InputError(f"scenario forked_road: seed is {seed}; choose 0 or more")
@@ -53,7 +53,7 @@ def forked_road(seed: int = 0, second: Literal["any", "none", "exit", "entry"] =
     tracks = [np.stack([v.numpy() for v in line.points[:3]], -1) for line in lines]
     truth = {"num_courses": np.array(len(lines)), "line": tracks[0]}
     if kind != "none":
-        truth |= {"branch": tracks[1], "joins": np.array(kind == "entry"), "place": np.array(place)}
+        truth |= {"branch": tracks[1], "joins": np.array(kind == "entry"), "place": np.array(place - MODEL.prior.behind)}
     info = {"scenario": "forked_road", "seed": seed, "second": kind, "cues": len(layout.kind)}
     return Scene(seen.cues, truth, f"forked_road {seed}, {'no second road' if kind == 'none' else 'an ' + kind}", info)
 
@@ -73,11 +73,11 @@ def parting(main: Line, joins: bool, place: float, rng: np.random.Generator) -> 
     if joins:
         bend = -bend  # an entry from the right bends to the left, seen from the motorway on the way back
     at = main.at(np.array([place]))
-    numbers = (at.x, at.y, at.heading + math.pi * joins, sign * at.curvature + bend)
     way = sign * (main.arc - place)
-    branch = Clothoid(*(v[0] for v in numbers), torch.tensor(rate), torch.tensor(way.max()))
-    x, y, heading, curvature = evaluate(branch, torch.from_numpy(way))
-    there = Points(x, y, heading - math.pi * joins, sign * curvature)
+    x, y, heading, curvature = (v[0] for v in (at.x, at.y, at.heading + math.pi * joins, sign * at.curvature + bend))
+    branch = Clothoid(x, y, heading, curvature, torch.tensor(rate), torch.tensor(way.max()))
+    there = evaluate(branch, torch.from_numpy(way))
+    there = there._replace(heading=there.heading - math.pi * joins, curvature=sign * there.curvature)
     parted = torch.from_numpy(way > 0.0)
     return Line(main.arc, Points(*(torch.where(parted, b, a) for a, b in zip(main.points, there, strict=True))))
 
@@ -86,7 +86,7 @@ def furnish(
     main: Line, branch: Line | None, joins: bool, place: float, rng: np.random.Generator
 ) -> tuple[Layout, Points]:
     """What stands and drives along both roads, and the points of the roads beside which it does."""
-    whole, points = Layout([], [], [], []), []
+    whole, points = Layout([], [], [], []), list[Points]()
     reach = rng.uniform(130.0, main.arc[-1])
     for line, other in ((main, branch), (branch, main)):
         if line is None:
@@ -95,13 +95,13 @@ def furnish(
         for kind, gap in (("guardrail", 20.0), ("delineator", 50.0)):
             for left in (False, True):
                 place_row(row, Row(kind, left, gap), reach, rng)
-        free = stands_free(row, line, other, line is branch)
-        ahead = place + 15.0 if line is branch and not joins else 15.0
-        first = rng.uniform(ahead, ahead + (place - 40.0 if joins else 40.0))
+        begin, free = len(whole.arc), stands_free(row, line, other, line is branch)
         for i in np.flatnonzero(free):
             whole.add(row.kind[i], row.left[i], len(whole.kind), row.arc[i])
+        first = place + 15.0 if line is branch and not joins else 15.0
+        first += rng.uniform(0.0, place - 40.0 if joins else 40.0)
         place_vehicle(whole, "car", False, float(first), rng.uniform(2.0, 4.0))
-        points.append(line.at(np.array(whole.arc[sum(len(p.x) for p in points) :])))
+        points.append(line.at(np.array(whole.arc[begin:])))
     return whole, Points(*(torch.cat(columns) for columns in zip(*points, strict=True)))
 
 
@@ -111,12 +111,12 @@ def stands_free(row: Layout, line: Line, other: Line | None, is_second: bool) ->
     if other is None:
         return np.ones(len(row.kind), dtype=bool)
     at, kinds = line.at(np.array(row.arc)), {kind.name: kind for kind in KINDS}
-    offset = np.array(
-        [getattr(kinds[k], "left" if left else "right")[0] for k, left in zip(row.kind, row.left, strict=True)]
-    )
-    beside = np.stack([at.x - np.sin(at.heading) * offset, at.y + np.cos(at.heading) * offset], -1)
+    sides = [kinds[k].left if left else kinds[k].right for k, left in zip(row.kind, row.left, strict=True)]
+    offset = np.array([mean for mean, _ in sides])
+    x, y, heading = (v.numpy() for v in at[:3])
+    beside = np.stack([x - np.sin(heading) * offset, y + np.cos(heading) * offset], -1)
     free = distance(beside, other) > CLEAR
-    return free & (distance(np.stack([at.x, at.y], -1), other) > APART) if is_second else free
+    return free & (distance(np.stack([x, y], -1), other) > APART) if is_second else free
 
 
 def distance(places: Floats, line: Line) -> Floats:

@@ -66,7 +66,8 @@ class CuesAlongFork(TorchDistribution):
         rows = (fork.main, fork.bend, offset)
         batch = torch.broadcast_shapes(*(v.shape for v in scalars), *(v.shape[:-1] for v in rows))
         main, bend, self.offset = (v.expand((*batch, v.shape[-1])) for v in rows)
-        self.fork = Fork(main, *(v.expand(batch) for v in scalars), bend)
+        num_courses, joins, shared = (v.expand(batch) for v in scalars)
+        self.fork = Fork(main, num_courses, joins, shared, bend)
         super().__init__(batch, torch.Size([len(evidence.group), 3]), validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -149,7 +150,8 @@ def both_courses(model: ForkedRoad, fork: Fork, arc: Tensor) -> tuple[Points, Po
     Beyond the place where they part, the second is as far from it as the arc length says."""
     length, arc = model.road.prior.length, arc.expand(*fork.shared.shape, -1)
     zero = torch.zeros_like(fork.shared)
-    main = Clothoid(zero - model.road.prior.behind, *fork.main.unbind(-1), zero + length)
+    lateral, heading, curvature, rate = fork.main.unbind(-1)
+    main = Clothoid(zero - model.road.prior.behind, lateral, heading, curvature, rate, zero + length)
     joins, shared = fork.joins.double(), fork.shared
     place = torch.where(joins > 0.0, length - shared, shared)
     sign = 1.0 - 2.0 * joins  # of the way from the shared part on
@@ -163,8 +165,10 @@ def both_courses(model: ForkedRoad, fork: Fork, arc: Tensor) -> tuple[Points, Po
         length - shared,
     )
     way = sign[..., None] * (arc - place[..., None])
-    x, y, heading, curvature = evaluate(there, way)
-    branch = Points(x, y, heading - math.pi * joins[..., None], sign[..., None] * curvature)
+    branch = evaluate(there, way)
+    branch = branch._replace(
+        heading=branch.heading - math.pi * joins[..., None], curvature=sign[..., None] * branch.curvature
+    )
     parted = (way > 0.0) & (fork.num_courses == 2)[..., None]
     first = evaluate(main, arc)
     return first, Points(*(torch.where(parted, b, a) for a, b in zip(first, branch, strict=True)))

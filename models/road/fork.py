@@ -121,7 +121,8 @@ class ForkedRoad:
         for b in range(len(z)):
             valid[b] = step(kind, z[b], numbers[b], floats, none, z_new[b], u_new[b], log_q[b])
         new = {n: torch.from_numpy(np.ascontiguousarray(v)) for n, v in unpack(z_new).items()}
-        return Proposal(new, torch.from_numpy(u_new), *torch.from_numpy(log_q).unbind(-1), torch.from_numpy(valid))
+        forward, backward, jacobian = torch.from_numpy(log_q).unbind(-1)
+        return Proposal(new, torch.from_numpy(u_new), forward, backward, jacobian, torch.from_numpy(valid))
 
     def kernel(self, evidence: RoadEvidence) -> Kernel:
         """The same density and moves in machine code."""

@@ -83,8 +83,8 @@ def bend(z, u, longest, settings, z_new, u_new):  # type: ignore[no-untyped-def]
 def slide(z, u, longest, settings, z_new, u_new, log_q):  # type: ignore[no-untyped-def]
     """The length shared, the end of the second course as far across as before, for u[5] < 1/2 in the same direction.
 
-    Its way is w before and w' after. Across the other course it is a v^2 + b v^3, v = way / w, with bend = 2 a / w^2 and
-    rate = 6 b / w^3. Keeping a + b by keeping a and b has the Jacobian (w / w')^5; keeping a + b and (2 a + 3 b) / w
+    Its way is w before and w' after. Across the other course it is a v^2 + b v^3, v = way / w, with bend = 2 a / w^2
+    and rate = 6 b / w^3. Keeping a and b has the Jacobian (w / w')^5; keeping a + b and the direction (2 a + 3 b) / w
     has (w / w')^4."""
     z_new[SHARED] += longest * (2.0 * u[0] - 1.0)
     u_new[0] = 1.0 - u[0]

@@ -29,7 +29,7 @@ MODEL = ForkedRoad()
 PAPER = ForkedRoad(road=RoadCourse(likelihood="paper"), share=0.3)
 SCENE = forked_road(10)
 EVIDENCE = MODEL.prepare(SCENE.data)
-MOVES = {move.name: move for move in MODEL.moves()}
+MOVES = {move.name: move for move in replace(MODEL, joining=0.3).moves()}
 LENGTH, BEHIND = MODEL.road.prior.length, MODEL.road.prior.behind
 
 
@@ -199,6 +199,16 @@ def test_odds_of_a_thing_are_what_the_share_changes() -> None:
     more, less = (log_prob(replace(MODEL, share=1 / (1 + math.exp(-s))), z) for s in (step, -step))
     expected = (1.0 / (1.0 + np.exp(-odds[:, first])) - 0.5).sum(-1)
     np.testing.assert_allclose((more - less) / (2 * step), expected, atol=1e-5)
+
+
+def test_a_vehicle_is_one_thing_and_every_post_is_one() -> None:
+    thing, num = things_of(EVIDENCE)
+    cars = EVIDENCE.moves
+    assert num == (~cars).sum() + len(set(EVIDENCE.group[cars]))
+    assert len(set(thing[~cars])) == (~cars).sum()
+    for group in set(EVIDENCE.group[cars]):
+        assert len(set(thing[EVIDENCE.group == group])) == 1
+    assert set(thing) == set(range(num))
 
 
 @pytest.mark.parametrize("name", MOVES)

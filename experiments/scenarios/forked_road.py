@@ -53,7 +53,8 @@ def forked_road(seed: int = 0, second: Literal["any", "none", "exit", "entry"] =
     tracks = [np.stack([v.numpy() for v in line.points[:3]], -1) for line in lines]
     truth = {"num_courses": np.array(len(lines)), "line": tracks[0]}
     if kind != "none":
-        truth |= {"branch": tracks[1], "joins": np.array(kind == "entry"), "place": np.array(place - MODEL.prior.behind)}
+        ahead = place - MODEL.prior.behind
+        truth |= {"branch": tracks[1], "joins": np.array(kind == "entry"), "place": np.array(ahead)}
     info = {"scenario": "forked_road", "seed": seed, "second": kind, "cues": len(layout.kind)}
     return Scene(seen.cues, truth, f"forked_road {seed}, {'no second road' if kind == 'none' else 'an ' + kind}", info)
 

@@ -14,7 +14,11 @@ The two courses leave each other without a kink. With one course the numbers of 
 density of the cues is that of RoadCourse; the main course is given by the clothoid's own numbers here, its start is
 `behind` metres behind the car and its length known, as neither can be seen.
 
-Posts that stand in a row share their offset whichever course they follow, and the side of a cue is that of its course.
+The two are no set of slots: one is a clothoid throughout, the other only from where they part. Two roads that are both
+nearly so can be named either way round, which is no factorial but two states; the move `swap` leads from one to the
+other. Posts that stand in a row share their offset whichever course they follow, and the side of a cue is that of its
+course. A second course that parts where cues no longer reach cannot be told from none, so that without one its
+probability falls to that of such courses, not to zero.
 """
 
 from __future__ import annotations

@@ -84,10 +84,7 @@ def _headline(scene: Scene, reach: float) -> str:
 
 
 def _draw_above(axes: Axes, cues: Cues, guess: Floats, band: tuple[Floats, Floats], reach: float) -> None:
-    tangent = np.gradient(guess, axis=0)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1) / np.hypot(*tangent.T)[:, None]
-    edges = [guess + side[:, None] * normal for side in band]
-    axes.fill(*np.concatenate([edges[0], edges[1][::-1]]).T, color=ESTIMATE, alpha=0.25, lw=0, label="90 % band")
+    draw_band(axes, guess, band, ESTIMATE)
     _draw_estimate(axes, guess, reach)
     _draw_cues(axes, cues)
     axes.plot(0.0, 0.0, marker="o", ms=9, mfc="white", mec=INK, mew=1.6, ls="none", label="the car", zorder=6)
@@ -95,6 +92,19 @@ def _draw_above(axes: Axes, cues: Cues, guess: Floats, band: tuple[Floats, Float
     middle, half = 0.5 * (lowest + highest), max(0.5 * (highest - lowest) + 4.0, 15.0)
     axes.set(xlim=(-12.0, RANGES[-1] + 12.0), ylim=(middle - half, middle + half), ylabel="y, to the left [m]")
     axes.grid(color=FAINT, lw=0.4)
+
+
+def draw_band(axes: Axes, line: Floats, band: tuple[Floats, Floats], color: str) -> None:
+    """The area from low to high (R,), to the left of a line (R, 2) [m]."""
+    normal = normals(line)
+    edges = [line + side[:, None] * normal for side in band]
+    axes.fill(*np.concatenate([edges[0], edges[1][::-1]]).T, color=color, alpha=0.25, lw=0, label="90 % band")
+
+
+def normals(line: Floats) -> Floats:
+    """Unit vectors (R, 2) to the left of a line (R, 2)."""
+    tangent = np.gradient(line, axis=0)
+    return np.stack([-tangent[:, 1], tangent[:, 0]], -1) / np.hypot(*tangent.T)[:, None]
 
 
 def _draw_estimate(axes: Axes, guess: Floats, reach: float) -> None:
@@ -109,16 +119,21 @@ def _draw_estimate(axes: Axes, guess: Floats, reach: float) -> None:
 
 def _draw_cues(axes: Axes, cues: Cues) -> None:
     """Cues by kind, with ellipses of one standard deviation."""
+    draw_spreads(axes, cues)
+    for kind in dict.fromkeys(cues.kind.tolist()):
+        marker, colour = LOOKS.get(kind, OTHER)
+        seen = cues.kind == kind
+        axes.plot(*cues.position[seen].T, marker=marker, color=colour, ms=5.5, mew=0, ls="none", label=kind, zorder=3)
+
+
+def draw_spreads(axes: Axes, cues: Cues) -> None:
+    """An ellipse of one standard deviation about each cue."""
     values, vectors = np.linalg.eigh(cues.covariance)
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     wide, narrow = 2.0 * np.sqrt(values[:, 1]), 2.0 * np.sqrt(values[:, 0])
     place = {"offsets": cues.position, "offset_transform": axes.transData}
     look = {"facecolors": "none", "edgecolors": "#9aa3ab", "linewidths": 0.6, "zorder": 2}
     axes.add_collection(EllipseCollection(wide, narrow, angle, units="xy", **place, **look))
-    for kind in dict.fromkeys(cues.kind.tolist()):
-        marker, colour = LOOKS.get(kind, OTHER)
-        seen = cues.kind == kind
-        axes.plot(*cues.position[seen].T, marker=marker, color=colour, ms=5.5, mew=0, ls="none", label=kind, zorder=3)
 
 
 def _draw_across(axes: Axes, guess: Floats, band: tuple[Floats, Floats], reach: float) -> None:

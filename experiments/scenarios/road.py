@@ -151,6 +151,11 @@ class Seen(NamedTuple):
 def see(layout: Layout, line: Line, rng: np.random.Generator, noise: np.random.SeedSequence) -> Seen:
     """The cues of a layout along a line (`along`). Offsets are drawn from the priors of the kinds; the noise is that at
     the true distance."""
+    return see_at(layout, line.at(np.array(layout.arc)), rng, noise)
+
+
+def see_at(layout: Layout, points: Points, rng: np.random.Generator, noise: np.random.SeedSequence) -> Seen:
+    """The same of cues that stand beside points (N,) of any road; their arc lengths do not matter."""
     num = len(layout.kind)
     vehicles = np.array([kind in ("car", "truck") for kind in layout.kind])
     cues = Cues(
@@ -165,7 +170,7 @@ def see(layout: Layout, line: Line, rng: np.random.Generator, noise: np.random.S
     )
     evidence = MODEL.prepare(cues)
     offset = evidence.offset_loc + evidence.offset_std * rng.standard_normal(len(evidence.offset_loc))
-    aside, points = offset[evidence.group], line.at(np.array(layout.arc))
+    aside = offset[evidence.group]
     x, y, heading = (v.numpy() for v in points[:3])
     true = np.stack([x - np.sin(heading) * aside, y + np.cos(heading) * aside], -1)
     cues = cues._replace(covariance=camera(true, vehicles), flow_std=0.02 + 0.0012 * np.hypot(*true.T))

@@ -34,9 +34,9 @@ def test_samples_equal_the_torch_ones() -> None:
     joined = torch.isfinite(FOUND.length)
     clothoids = Clothoid(*(number[joined] for number in FOUND))
     points = sample(clothoids, NUM)
-    expected = torch.stack(
-        [points.x, points.y, points.heading, torch.cos(points.heading), torch.sin(points.heading), points.curvature], -1
-    )
+    arc = torch.linspace(0.0, 1.0, NUM, dtype=torch.float64) * clothoids.length[:, None]
+    direction = (points.heading, torch.cos(points.heading), torch.sin(points.heading))
+    expected = torch.stack([points.x, points.y, *direction, points.curvature, arc], -1)
     for i, numbers in enumerate(torch.stack(clothoids, -1).numpy()):
         table = np.empty((NUM, COLUMNS))
         assert sample_one(numbers, table) == pytest.approx(numbers[LENGTH] / (NUM - 1), rel=1e-12)

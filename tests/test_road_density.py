@@ -79,7 +79,7 @@ def written_down(model: RoadCourse, evidence: RoadEvidence, x: Tensor) -> Tensor
     else:
         single = follows
     there = normal(foot, (variance + model.change_std**2).sqrt())
-    there = there + torch.where(seen, normal(gap, torch.hypot(flow_std, torch.tensor(model.change_turn))), 0.0)
+    there = there + torch.where(seen, normal(gap, torch.hypot(flow_std, torch.full_like(flow_std, model.change_turn))), 0.0)
     wide = evidence._replace(spread=np.hypot(evidence.spread, model.change_std))
     there = there + in_sight(model, wide, angle, length, foot)
     total = torch.zeros(len(x), dtype=torch.float64)

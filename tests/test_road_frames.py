@@ -25,6 +25,7 @@ from tests.drawn_drives import SECONDS, SPEED, drawn_drive
 
 MODEL = RoadFrames()
 PURE, PAPER = RoadFrames(course=RoadCourse(clutter=0.0)), RoadFrames(course=RoadCourse(likelihood="paper"))
+SINGLE = [RoadFrames(course=RoadCourse(lane_changes=0.0, clutter=c)) for c in (0.05, 0.0)]  # every cue by itself
 MODELS = pytest.mark.parametrize("model", [MODEL, PURE, PAPER], ids=["exact", "pure", "paper"])
 FRAMES, TRUTH = drawn_drive(MODEL, 3, 3)
 
@@ -38,7 +39,7 @@ def about_truth(num: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(road), torch.from_numpy(offset)
 
 
-@MODELS
+@pytest.mark.parametrize("model", [*SINGLE, PAPER], ids=["exact", "pure", "paper"])
 def test_density_is_that_of_the_cues_about_the_nearest_samples(model: RoadFrames) -> None:
     """The table by models.clothoid, the nearest sample by looking at all of them."""
     road, offset = about_truth(5)

@@ -31,7 +31,7 @@ from models.road.segments import CuesAlongPieces, SegmentedRoad, batched_moves
 from tests.involution import assert_involution, uniforms
 
 Floats = NDArray[np.float64]
-ROAD = SegmentedRoad(RoadCourse(clutter=0.1))
+ROAD = SegmentedRoad(RoadCourse(clutter=0.1, reach=math.inf, lane_changes=0.0))
 PURE = SegmentedRoad(RoadCourse(clutter=0.0))
 PAPER = SegmentedRoad(RoadCourse(likelihood="paper", beta_static=0.7, beta_vehicle=1.3, beta_flow=0.4))
 MODELS = pytest.mark.parametrize("model", [ROAD, PURE, PAPER], ids=["exact", "pure", "paper"])
@@ -85,6 +85,7 @@ def test_samples_lie_along_the_integral_of_the_curvature() -> None:
         assert np.abs(table[row, :, :2] - expected[:, :2]).max() < bound
         np.testing.assert_allclose(table[row, :, 2], expected[:, 2], atol=1e-6)
         np.testing.assert_allclose(table[row, :, 5], curvature_at(z, s[::500]), atol=1e-12)
+        np.testing.assert_allclose(table[row, :, 6], s[::500], atol=1e-9)
         np.testing.assert_allclose(
             table[row, :, 3:5], np.stack([np.cos(table[row, :, 2]), np.sin(table[row, :, 2])], -1)
         )
@@ -98,7 +99,7 @@ def test_density_is_the_one_written_down() -> None:
     table = road_samples(latents, course.prior.length, course.num_samples)
     px, py, flow = evidence.cues.numpy().T
     for row in range(30):
-        x, y, heading, cos, sin, bend = table[row].T
+        x, y, heading, cos, sin, bend, _ = table[row].T
         nearest = ((px[:, None] - x) ** 2 + (py[:, None] - y) ** 2).argmin(1)
         heading, cos, sin, bend = (column[nearest] for column in (heading, cos, sin, bend))
         dx, dy = px - x[nearest], py - y[nearest]

@@ -200,7 +200,14 @@ def score_groups(paper, cues, group, near, offset, table, out, changes):  # type
             there[g] += exact_cue(cues, n, offset[g], table, k, True, rows)[0]
     for g in range(len(offset)):
         if changes[g] > 0.0:
-            stays, leaves = math.log1p(-changes[g]) + out[g], math.log(changes[g]) + there[g]
-            most = max(stays, leaves)
-            out[g] = most + math.log(math.exp(stays - most) + math.exp(leaves - most))
-            changes[g] = math.exp(leaves - out[g])
+            out[g], changes[g] = with_changes(changes[g], out[g], there[g])
+
+
+@nb.njit(error_model="numpy")
+def with_changes(chance, stays, leaves):  # type: ignore[no-untyped-def]
+    """Log density of a vehicle that changes lanes with a chance, from those if it stays and if it leaves; and the
+    probability that it leaves."""
+    stays, leaves = math.log1p(-chance) + stays, math.log(chance) + leaves
+    most = max(stays, leaves)
+    total = most + math.log(math.exp(stays - most) + math.exp(leaves - most))
+    return total, math.exp(leaves - total)

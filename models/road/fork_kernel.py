@@ -12,10 +12,10 @@ import math
 import numba as nb
 import numpy as np
 
-from models.clothoid_kernel import BEND, COLUMNS, COS, CURVATURE, HEADING, RATE, SIN, X, Y, sample_one
+from models.clothoid_kernel import ARC, BEND, COLUMNS, COS, CURVATURE, HEADING, RATE, SIN, X, Y, sample_one
 from models.clothoid_kernel import LENGTH as LENGTH_OF
 from models.intersection.window import window
-from models.road.cue_kernel import WIDTH, nearest_sample, score_cue
+from models.road.cue_kernel import CHANGES, LOCAL, WIDTH, exact_cue, nearest_sample, score_cue, with_changes
 
 # a packed state: number of courses, whether the second joins, length shared, what its curvature and rate have more;
 # lateral and heading of the start of the main course, curvature, rate; offsets
@@ -31,7 +31,7 @@ COUNTS = 5
 
 @nb.njit(error_model="numpy")
 def turn_round(table, half_turn):  # type: ignore[no-untyped-def]
-    """Samples (num, 6) as one meets them on the way back, in place; half_turn is pi or, to undo it, -pi."""
+    """Samples (num, 7) as one meets them on the way back, in place; half_turn is pi or, to undo it, -pi."""
     num = len(table)
     for k in range((num + 1) // 2):
         other = num - 1 - k
@@ -44,7 +44,7 @@ def turn_round(table, half_turn):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def go_on(piece, distance, pair):  # type: ignore[no-untyped-def]
-    """A clothoid (6,) seen from `distance` [m] farther along, in place; pair (2, 6) is scratch."""
+    """A clothoid (6,) seen from `distance` [m] farther along, in place; pair (2, 7) is scratch."""
     piece[LENGTH_OF] = distance
     sample_one(piece, pair)
     piece[X], piece[Y], piece[HEADING], piece[CURVATURE] = pair[1, X], pair[1, Y], pair[1, HEADING], pair[1, BEND]
@@ -52,7 +52,7 @@ def go_on(piece, distance, pair):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def lay_second(z, first, step, second):  # type: ignore[no-untyped-def]
-    """Samples of the second course into second (num, 6), from those of the first."""
+    """Samples of the second course into second (num, 7), from those of the first."""
     joins, shared, rate = z[JOINS] == 1.0, z[SHARED], z[MAIN + 3]
     second[:] = first
     if joins:
@@ -70,11 +70,13 @@ def lay_second(z, first, step, second):  # type: ignore[no-untyped-def]
     sample_one(piece, rest)
     if joins:
         turn_round(second, -math.pi)
+    for i in range(len(second)):
+        second[i, ARC] = i * step
 
 
 @nb.njit(error_model="numpy")
 def lay_first(z, floats, first):  # type: ignore[no-untyped-def]
-    """Samples of the first course into first (num, 6); returns their step [m]."""
+    """Samples of the first course into first (num, 7); returns their step [m]."""
     clothoid = np.empty(6)
     clothoid[X], clothoid[LENGTH_OF] = -floats[BEHIND], floats[LENGTH]
     for i in range(4):
@@ -84,7 +86,7 @@ def lay_first(z, floats, first):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def lay_courses(z, floats, first, second):  # type: ignore[no-untyped-def]
-    """Samples of both courses, first and second (S, num, 6), of packed states z (S, D)."""
+    """Samples of both courses, first and second (S, num, 7), of packed states z (S, D)."""
     for i in range(len(z)):
         step = lay_first(z[i], floats, first[i])
         lay_second(z[i], first[i], step, second[i])
@@ -97,16 +99,25 @@ def log_likelihood(z, floats, ints, odds):  # type: ignore[no-untyped-def]
     groups, num_cues, num, things = ints[GROUPS], ints[CUES], ints[SAMPLES], ints[THINGS]
     cues = window(floats, SETTINGS + 2 * groups, (num_cues, WIDTH))
     group, thing = window(ints, COUNTS, (num_cues,)), window(ints, COUNTS + num_cues, (num_cues,))
-    first, second, rows = np.empty((num, COLUMNS)), np.empty((num, COLUMNS)), np.empty((0, 6))
+    first, second, rows = np.empty((num, COLUMNS)), np.empty((num, COLUMNS)), np.empty((0, LOCAL))
     paper, forks, step = ints[PAPER] == 1, z[COURSES] == 2.0, lay_first(z, floats, first)
     if forks:
         lay_second(z, first, step, second)
-    along, total = np.zeros((things, 2)), 0.0
+    along, leaves, chance, total = np.zeros((things, 2)), np.zeros((things, 2)), np.zeros(things), 0.0
     for n in range(num_cues):
         o, t = z[HEAD + group[n]], thing[n]
-        along[t, 0] += score_cue(paper, cues, n, o, first, nearest_sample(cues, n, first, step), rows)[0]
-        if forks:
-            along[t, 1] += score_cue(paper, cues, n, o, second, nearest_sample(cues, n, second, step), rows)[0]
+        chance[t] = cues[n, CHANGES]
+        for course in range(2 if forks else 1):
+            table = second if course else first
+            k = nearest_sample(cues, n, table, step)
+            along[t, course] += score_cue(paper, cues, n, o, table, k, rows)[0]
+            if chance[t] > 0.0:
+                leaves[t, course] += exact_cue(cues, n, o, table, k, True, rows)[0]
+    for t in range(things):
+        if chance[t] > 0.0:
+            along[t, 0] = with_changes(chance[t], along[t, 0], leaves[t, 0])[0]
+            if forks:
+                along[t, 1] = with_changes(chance[t], along[t, 1], leaves[t, 1])[0]
     for t in range(things):
         if not forks:
             total += along[t, 0]

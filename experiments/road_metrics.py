@@ -83,7 +83,7 @@ def half_width(tube: str) -> Floats:
 class Roads(NamedTuple):
     """Samples of roads at equal steps of arc length, whatever model they are of.
 
-    table  (D, SAMPLES, 6): x, y, heading, its cosine and sine, curvature
+    table  (D, SAMPLES, 7): x, y, heading, its cosine and sine, curvature, arc length
     step   (D,) [m], inf where there is no road
     """
 
@@ -116,14 +116,40 @@ def drawn_roads(posterior: Posterior, num_draws: int = 400) -> Roads:
 
 
 def estimated_road(posterior: Posterior, num_draws: int = 400) -> Roads:
-    """One road: the mean of `course` where the draws have one; else the mean of drawn roads, sample by sample, for
-    numbers of roads with different knots have no mean that is a road."""
+    """One road: the clothoid of the mean numbers (start, curvature, rate, length) where the draws have a `course`; else
+    the mean of drawn roads, sample by sample, for numbers of roads with different knots have no mean that is a road.
+
+    The mean of `course` itself would lie inside its bend: cues say little of where the road ends, so that draws end
+    here and there along it."""
     if "course" in posterior.draws:
-        return lay_courses(posterior.mean("course")[None])
+        return lay_mean(posterior)
     roads = drawn_roads(posterior, num_draws)
     table = roads.table.mean(0)
     table[:, COS], table[:, SIN] = np.cos(table[:, HEADING]), np.sin(table[:, HEADING])
     return Roads(table[None], roads.step[:1])
+
+
+def lay_mean(posterior: Posterior) -> Roads:
+    """The clothoid whose numbers are the means of those of the drawn courses, unless no draw has any."""
+    numbers = fitted(np.ascontiguousarray(posterior.draws["course"].reshape(-1, 6)))
+    there = np.isfinite(numbers[:, LENGTH])
+    share = posterior.weights.reshape(-1) * there
+    if not share.sum() > 0.0:
+        return lay_courses(posterior.mean("course")[None])
+    roads = Roads(np.empty((1, SAMPLES, COLUMNS)), np.empty(1))
+    mean = share[there] @ numbers[there] / share.sum()
+    roads.step[0] = sample_one(mean, roads.table[0])  # type: ignore[call-arg]
+    return roads
+
+
+@nb.njit(cache=True)
+def fitted(courses: Floats) -> Floats:
+    """Numbers of the clothoids of courses (D, 6), (D, 6); length inf where none joins the ends."""
+    out = np.empty(courses.shape)
+    for d in range(len(courses)):
+        c = courses[d]
+        hermite_one(c[0], c[1], c[2], c[3], c[4], c[5], out[d])
+    return out
 
 
 def lay_courses(courses: Floats) -> Roads:

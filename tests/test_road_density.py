@@ -79,7 +79,8 @@ def written_down(model: RoadCourse, evidence: RoadEvidence, x: Tensor) -> Tensor
     else:
         single = follows
     there = normal(foot, (variance + model.change_std**2).sqrt())
-    there = there + torch.where(seen, normal(gap, torch.hypot(flow_std, torch.full_like(flow_std, model.change_turn))), 0.0)
+    swerving = torch.hypot(flow_std, torch.full_like(flow_std, model.change_turn))
+    there = there + torch.where(seen, normal(gap, swerving), 0.0)
     wide = evidence._replace(spread=np.hypot(evidence.spread, model.change_std))
     there = there + in_sight(model, wide, angle, length, foot)
     total = torch.zeros(len(x), dtype=torch.float64)

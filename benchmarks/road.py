@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 
 def measurements() -> tuple[fig.Measurement, ...]:
     """All measurements but the yardstick, in the order of the table."""
-    from benchmarks import road_accuracy, road_robust, road_speed
+    from benchmarks import road_accuracy, road_robust, road_segments, road_speed
 
-    return tuple(m for part in (road_accuracy, road_robust, road_speed) for m in part.MEASUREMENTS)
+    parts = (road_accuracy, road_robust, road_segments, road_speed)
+    return tuple(m for part in parts for m in part.MEASUREMENTS)
 
 
 def efforts() -> tuple[Effort, Effort]:

@@ -165,12 +165,10 @@ def run(task: Task, say: Callable[[str], None] = print) -> None:
     from experiments.schema import build
     from inference import empirical_bayes
     from models.program import InputError
-    from models.road.course import RoadCourse
-    from models.road.hyper import hyper
 
     model, engine, metrics = (build(task.config[key], key) for key in ("model", "engine", "metrics"))
-    if not isinstance(model, RoadCourse):
-        raise InputError(f"learning knows settings of RoadCourse, not of {type(model).__name__}; choose a road course")
+    if not hasattr(model, "hyper"):
+        raise InputError(f"{type(model).__name__} has no settings to learn (hyper()); choose model=road_course")
     if "progress" in getattr(engine, "keywords", {}):
         engine.keywords["progress"] = False
     scenes, others = ([build(scene, "scenario") for scene in each] for each in (task.scenes, task.held_out))
@@ -178,7 +176,7 @@ def run(task: Task, say: Callable[[str], None] = print) -> None:
         check_reads(model, scene.data)
     say(f"scenes     {len(scenes)} to learn from, {len(others)} held out")
     data, knobs = [scene.data for scene in scenes], task.knobs
-    family = hyper(model, data, task.names)
+    family = model.hyper(data, task.names)
     seed, began = engine_seed(task.config["seed"]), time.perf_counter()
     learnt = empirical_bayes.learn(
         family, data, engine, seed=seed, num_draws=knobs["num_draws"], num_rounds=knobs["num_rounds"]

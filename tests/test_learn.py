@@ -83,7 +83,7 @@ def test_other_models_and_scenarios_are_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert guarded(lambda: learn(["scenario=line", "model=gaussian", "scenes=2", "held_out=2"])) == 2
-    assert "learning knows settings of RoadCourse, not of" in capsys.readouterr().err
+    assert "ConjugateGaussian has no settings to learn (hyper())" in capsys.readouterr().err
     assert guarded(lambda: learn([*WORDS, "scenario=line"])) == 2
     assert "reads Cues" in capsys.readouterr().err
 

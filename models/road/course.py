@@ -21,6 +21,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -33,12 +34,13 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 from scipy.special import ndtri
 
-from models.capability import Chart, Factors, Squares
+from models.capability import Chart, Factors, Hyper, Squares
 from models.program import InputError
 from models.road.along_road import CuesAlongRoad, cue_arrays, kernel_settings
 from models.road.cue_kernel import SPREADS
 from models.road.cues import KINDS, CueKind, Cues
 from models.road.evidence import RoadEvidence, road_evidence
+from models.road.hyper import hyper
 from models.road.kernel import density_slopes, group_densities, normal_equations
 from models.road.numbers import log_volumes, number_moments, prior_root, to_courses, to_numbers
 from models.road.prior import USUAL_ROADS, CoursePrior, course_moments
@@ -165,6 +167,10 @@ class RoadCourse:
         evaluate = partial(_evaluate, self._kernel(evidence))
         chart = Chart(*(partial(part, prior=self.prior) for part in (to_courses, to_numbers, log_volumes)))
         return Squares(loc, scale, sites, {"course": (6,), "offset": (num,)}, evaluate, 0.0, {"course": chart})
+
+    def hyper(self, scenes: Sequence[Cues], names: Sequence[str] = ()) -> Hyper:
+        """Settings by these names, or all that scenes teach: see models.road.hyper."""
+        return hyper(self, scenes, names)
 
     def follows(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> Floats:
         """Probability (N,) of each cue to follow the road, the mean over draws of course (S, 6) and offset (S, G)."""

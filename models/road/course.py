@@ -46,7 +46,7 @@ from models.road.numbers import log_volumes, number_moments, prior_root, to_cour
 from models.road.prior import USUAL_ROADS, CoursePrior, course_moments
 
 Floats = NDArray[np.float64]
-FIRST_ROADS = (16, 4)  # places and directions of the end that a start is the best of
+FIRST_ROADS = (8, 2)  # places and directions of the end that a start is the best of
 FOGS = (3.0, 1.0, 0.4)  # [m]
 
 

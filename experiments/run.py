@@ -146,9 +146,9 @@ def _infer(engine: Engine, model: Any, evidence: Any, seed: int) -> Posterior:
     except InputError as error:
         if "fix()" not in str(error) or not hasattr(model, "moves"):
             raise
-        fit = "engine=rjmcmc"
-        if hasattr(model, "start"):
-            fit += ", rjmcmc_structure or, its structure fixed, bbvi_structure"
+        fit = "engine=rjmcmc or smc_structure"
+        if hasattr(model, "kernel") and model.kernel(evidence).num_edits:  # a greedy search can polish it
+            fit = "engine=rjmcmc, rjmcmc_structure, smc_structure or, its structure fixed, bbvi_structure"
         raise InputError(
             f"{type(model).__name__} counts with discrete latents, which this engine does not sample; "
             f"choose {fit} (from Python: {error})"

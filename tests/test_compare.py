@@ -60,7 +60,7 @@ def test_an_engine_nobody_asked_for_may_refuse_the_model(launch: Command) -> Non
     done = launch(*words, module="experiments.compare")
     assert done.returncode == 0, done.stderr
     assert "least_squares: SlotRoad counts with discrete latents" in done.stdout
-    assert "choose engine=rjmcmc (from Python: " in done.stdout
+    assert "choose engine=rjmcmc or smc_structure (from Python: " in done.stdout
     done = launch(*words[:3], "engines=[least_squares]", module="experiments.compare")
     assert done.returncode == 2 and "none, no engine ran" in done.stdout
     done = launch(*words, "engines=[least_squares,rjmcmc]", module="experiments.compare")

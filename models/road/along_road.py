@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from models.clothoid import Points, evaluate, hermite
+from models.compiled_density import compiled_log_prob
 from models.program import InputError
 from models.road.cue_kernel import WIDTH
 from models.road.evidence import RoadEvidence
@@ -46,7 +47,13 @@ class CuesAlongRoad(TorchDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         numbers = torch.cat([self.course, self.offset], -1)
         value = value.expand((*self.batch_shape, *self.event_shape))
-        return _LogProb.apply(numbers, value, self.model, self.evidence)  # type: ignore[no-any-return]
+        return compiled_log_prob(numbers, value, self._evaluate)
+
+    def _evaluate(self, numbers: Floats, cues: Floats) -> tuple[Floats, Floats]:
+        height, slope = np.empty(len(numbers)), np.empty_like(numbers)
+        rows = cue_arrays(self.model, self.evidence, cues)
+        slopes_in_course(numbers, *kernel_settings(self.model), *rows, height, slope)  # type: ignore[call-arg]
+        return height, slope
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         if self.evidence.arc is None:
@@ -132,37 +139,3 @@ def _log_constant(precision: Floats, measured: NDArray[np.bool_]) -> Floats:
     """Logarithms of what normalises the normal densities of a cue, but for the variance across."""
     flow = np.where(measured, np.log(np.where(measured, precision, 1.0)) - 0.5 * math.log(2 * math.pi), 0.0)
     return np.asarray(flow - 0.5 * math.log(2 * math.pi))
-
-
-class _LogProb(torch.autograd.Function):
-    """Log density (*B) of cues (*B, N, 3) at numbers (*B, 6 + G)."""
-
-    @staticmethod
-    def forward(ctx: Any, numbers: Tensor, value: Tensor, model: RoadCourse, evidence: RoadEvidence) -> Tensor:
-        rows = numbers.detach().reshape(-1, numbers.shape[-1]).numpy()
-        seen = value.detach().reshape(len(rows), -1, 3)
-        height, slope, settings = np.empty(len(rows)), np.empty_like(rows), kernel_settings(model)
-        same = value.dim() == 2 or all(step == 0 for step in value.stride()[:-2])
-        fixed = cue_arrays(model, evidence, seen[0].numpy()) if same else None
-        for i, z in enumerate(rows):
-            cues = fixed or cue_arrays(model, evidence, seen[i].numpy())
-            height[i] = slopes_in_course(z, *settings, *cues, slope[i])  # type: ignore[call-arg]
-        ctx.save_for_backward(numbers, torch.from_numpy(slope).reshape(numbers.shape))
-        return torch.from_numpy(height).reshape(numbers.shape[:-1])
-
-    @staticmethod
-    def backward(ctx: Any, height: Tensor) -> tuple[Tensor | None, ...]:
-        numbers, slope = ctx.saved_tensors
-        return _Slope.apply(height, numbers, slope), None, None, None
-
-
-class _Slope(torch.autograd.Function):
-    """The gradient, tied to the numbers it belongs to: its own derivative would else be zero without a word."""
-
-    @staticmethod
-    def forward(ctx: Any, height: Tensor, numbers: Tensor, slope: Tensor) -> Tensor:
-        return height[..., None] * slope
-
-    @staticmethod
-    def backward(ctx: Any, height: Tensor) -> tuple[Tensor | None, ...]:
-        raise RuntimeError("the density of cues along a road has first derivatives only; use RoadCourse.squares")

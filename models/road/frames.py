@@ -40,6 +40,7 @@ from torch.distributions import constraints
 
 from models.capability import GaussianStep, State
 from models.clothoid import Clothoid, evaluate
+from models.compiled_density import compiled_log_prob
 from models.program import InputError
 from models.road.along_road import cue_arrays, scatter
 from models.road.course import RoadCourse
@@ -201,7 +202,12 @@ class CuesAlongClothoid(TorchDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         numbers = torch.cat([self.road, self.offset], -1)
         value = value.expand((*self.batch_shape, *self.event_shape))
-        return _LogProb.apply(numbers, value, self.model, self.evidence)  # type: ignore[no-any-return]
+        return compiled_log_prob(numbers, value, self._evaluate)
+
+    def _evaluate(self, numbers: Floats, cues: Floats) -> tuple[Floats, Floats]:
+        height, slope, empty = np.empty(len(numbers)), np.empty_like(numbers), np.empty((0, 0, 0))
+        frame_slopes(numbers, *self.model.arguments(self.evidence, cues), height, slope, empty)  # type: ignore[call-arg]
+        return height, slope
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         if self.evidence.arc is None:
@@ -212,39 +218,3 @@ class CuesAlongClothoid(TorchDistribution):
         road, offset = self.road.expand((*shape, ROAD)), self.offset.expand((*shape, self.offset.shape[-1]))
         points = evaluate(self.model.clothoid(road), torch.from_numpy(self.evidence.arc).expand(*shape, -1))
         return scatter(points, offset[..., torch.from_numpy(self.evidence.group)], self.evidence, self.model.course)
-
-
-class _LogProb(torch.autograd.Function):
-    """Log density (*B) of cues (*B, N, 3) at numbers (*B, 4 + G)."""
-
-    @staticmethod
-    def forward(ctx: Any, numbers: Tensor, value: Tensor, model: RoadFrames, evidence: RoadEvidence) -> Tensor:
-        z = np.ascontiguousarray(numbers.detach().reshape(-1, numbers.shape[-1]).numpy())
-        seen = value.detach().reshape(len(z), -1, 3)
-        height, slope, empty = np.empty(len(z)), np.empty_like(z), np.empty((0, 0, 0))
-        same = value.dim() == 2 or all(step == 0 for step in value.stride()[:-2])
-        for part in [slice(0, len(z))] if same else [slice(i, i + 1) for i in range(len(z))]:
-            arguments = model.arguments(evidence, seen[part.start].numpy())
-            if ctx.needs_input_grad[0]:
-                frame_slopes(z[part], *arguments, height[part], slope[part], empty)  # type: ignore[call-arg]
-            else:
-                frame_densities(z[part], *arguments, height[part])  # type: ignore[call-arg]
-        ctx.save_for_backward(numbers, torch.from_numpy(slope).reshape(numbers.shape))
-        return torch.from_numpy(height).reshape(numbers.shape[:-1])
-
-    @staticmethod
-    def backward(ctx: Any, height: Tensor) -> tuple[Tensor | None, ...]:
-        numbers, slope = ctx.saved_tensors
-        return _Slope.apply(height, numbers, slope), None, None, None
-
-
-class _Slope(torch.autograd.Function):
-    """The gradient, tied to the numbers it belongs to: its own derivative would else be zero without a word."""
-
-    @staticmethod
-    def forward(ctx: Any, height: Tensor, numbers: Tensor, slope: Tensor) -> Tensor:
-        return height[..., None] * slope
-
-    @staticmethod
-    def backward(ctx: Any, height: Tensor) -> tuple[Tensor | None, ...]:
-        raise RuntimeError("the density of cues along a clothoid has first derivatives only")

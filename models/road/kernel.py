@@ -181,21 +181,23 @@ def normal_equations(z, course, num, paper, cues, group, hessian, gradient):  # 
 
 
 @nb.njit(cache=True, error_model="numpy")
-def slopes_in_course(z, num, paper, cues, group, gradient):  # type: ignore[no-untyped-def]
-    """Log density of the cues at z (6 + G,), a course C and offsets [m], and its gradient (6 + G,)."""
+def slopes_in_course(z, num, paper, cues, group, height, gradient):  # type: ignore[no-untyped-def]
+    """Log density of the cues, height (S,), and its gradient (S, 6 + G) at courses C and offsets [m], z (S, 6 + G)."""
     theta, fit, empty = np.empty(6), np.empty((3, 6)), np.empty((0, 0))
-    hermite_one(z[0], z[1], z[2], z[3], z[4], z[5], theta)
-    if theta[LENGTH] == np.inf:
-        gradient[:] = 0.0
-        return (len(z) - 6) * NO_ROAD
-    height = linearise(theta, z[6:], num, paper, cues, group, gradient, empty)
-    hermite_slopes(z[:6], theta, fit)
-    shape = gradient[3:6].copy()
-    gradient[3:6] = 0.0  # the start of the clothoid is that of the course
-    for j in range(6):
-        for i in range(3):
-            gradient[j] += fit[i, j] * shape[i]
-    return height
+    for s in range(len(z)):
+        c, slope = z[s], gradient[s]
+        hermite_one(c[0], c[1], c[2], c[3], c[4], c[5], theta)
+        if theta[LENGTH] == np.inf:
+            slope[:] = 0.0
+            height[s] = (len(c) - 6) * NO_ROAD
+            continue
+        height[s] = linearise(theta, c[6:], num, paper, cues, group, slope, empty)
+        hermite_slopes(c[:6], theta, fit)
+        shape = slope[3:6].copy()
+        slope[3:6] = 0.0  # the start of the clothoid is that of the course
+        for j in range(6):
+            for i in range(3):
+                slope[j] += fit[i, j] * shape[i]
 
 
 @nb.njit(cache=True, error_model="numpy")

@@ -12,7 +12,7 @@ from benchmarks.configured import quiet_engine
 from benchmarks.figure import Figure, Measurement, Value, Values
 from benchmarks.road_trials import MODEL, Effort, drive, frozen
 
-DRAWS = 400  # as many as the checks of a course count
+DRAWS = 400  # enough for bands
 ENGINES: dict[str, tuple[str, dict[str, Any], float]] = {
     "ms_lm": ("least_squares", {"num_draws": DRAWS, "tolerance": 1e-6}, 1.0),
     "ms_bbvi": ("bbvi", {"num_samples": 64, "num_steps": 15, "num_snapshots": 0, "num_draws": DRAWS}, 10.0),

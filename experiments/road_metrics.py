@@ -91,7 +91,7 @@ class Roads(NamedTuple):
     step: Floats
 
 
-def check_course(posterior: Posterior, line: Floats, num_draws: int = 400) -> RoadCheck:
+def check_course(posterior: Posterior, line: Floats, num_draws: int = 1000) -> RoadCheck:
     """The estimated road against a true line (M, 3), or (M, 2), that begins behind the car.
 
     num_draws  of the posterior that spread, coverage and range are counted from"""
@@ -108,14 +108,14 @@ def has_road(posterior: Posterior) -> bool:
     return "course" in posterior.draws or "knot_curvature" in posterior.draws
 
 
-def drawn_roads(posterior: Posterior, num_draws: int = 400) -> Roads:
+def drawn_roads(posterior: Posterior, num_draws: int = 1000) -> Roads:
     """Equally weighted draws, at most `num_draws` of them."""
     if "course" in posterior.draws:
         return lay_courses(drawn_courses(posterior, num_draws))
     return lay_draws(posterior.resample(num_draws, 0))
 
 
-def estimated_road(posterior: Posterior, num_draws: int = 400) -> Roads:
+def estimated_road(posterior: Posterior, num_draws: int = 1000) -> Roads:
     """One road: the clothoid of the mean numbers (start, curvature, rate, length) where the draws have a `course`; else
     the mean of drawn roads, sample by sample, for numbers of roads with different knots have no mean that is a road.
 
@@ -167,7 +167,7 @@ def lay_draws(draws: dict[str, Floats]) -> Roads:
     return Roads(table, np.full(len(table), LAID / (SAMPLES - 1)))
 
 
-def drawn_courses(posterior: Posterior, num_draws: int = 400) -> Floats:
+def drawn_courses(posterior: Posterior, num_draws: int = 1000) -> Floats:
     """Equally weighted draws of `course`, at most `num_draws` of them, (D, 6)."""
     courses = posterior.draws["course"].reshape(-1, 6)
     if posterior.log_weights is None and len(courses) <= num_draws:

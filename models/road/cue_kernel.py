@@ -59,7 +59,7 @@ RESIDUALS, LOCAL = (
 )  # of a cue, at most; a residual and its slopes in along, across, heading, curvature, offset, arc
 ROOT_HALF = math.sqrt(0.5)
 LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
-FAR_INSIDE = 8.0  # standard deviations of sight from where log Phi is flat
+FAR_INSIDE = 6.5  # standard deviations of sight from where log Phi is flat
 
 
 @nb.njit(error_model="numpy")
@@ -104,12 +104,13 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     turn = wrap(cues[n, FLOW] - table[k, HEADING] - q - cues[n, TURN]) * precision
     log_road, weight = constant - 0.5 * (e * e + turn * turn), 1.0
     skew = norm * (my * sx - mx * sy)  # t' Sigma m
-    slant, blur, sight = skew / variance, 1.0, math.inf
+    slant, blur, sight, log_seen = skew / variance, 1.0, math.inf, 0.0
     if cues[n, REACH] < math.inf:
         blur = math.sqrt(cues[n, BLUR] + cues[n, SXX] + cues[n, SYY] - (variance - spread) - slant * skew)
         sight = (cues[n, REACH] - table[k, ARC] - along + slant * lateral) / blur
     if sight < FAR_INSIDE:
-        log_road += log_normal_share(sight)
+        log_seen = log_normal_share(sight)
+        log_road += log_seen
     if clutter > 0.0:
         road = root * math.exp(log_road)
         weight = road / (road + clutter)
@@ -127,7 +128,7 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * precision, -precision
     rows[2, 4] = -along * precision
     if sight < FAR_INSIDE:
-        inverse_mills = math.exp(-0.5 * sight * sight - LOG_ROOT - log_normal_share(sight))
+        inverse_mills = math.exp(-0.5 * sight * sight - LOG_ROOT - log_seen)
         pull = math.sqrt(inverse_mills * (sight + inverse_mills))  # of the curvature of log Phi
         unlike = 2.0 * (variance - spread) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
         slant_turn = (unlike + 2.0 * slant * skew) / variance  # d slant / d heading

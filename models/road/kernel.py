@@ -68,39 +68,48 @@ def linearise(theta, offset, num, paper, cues, group, gradient, hessian):  # typ
     score_groups(paper, cues, group, near, offset, table, height, changes)
     gradient[:] = 0.0
     hessian[:] = 0.0
+    local = np.empty(LOCAL)
     for n in range(len(cues)):
         k, g = near[n], group[n]
         c, s = table[k, COS], table[k, SIN]
         dx, dy = cues[n, 0] - table[k, 0], cues[n, 1] - table[k, 1]
         along, across = dx * c + dy * s, dy * c - dx * s
+        local[:] = 0.0  # the gradient in the local numbers
         for leaves in range(2 if changes[g] > 0.0 else 1):
             if leaves:
                 weight = changes[g] * exact_cue(cues, n, offset[g], table, k, True, rows)[1]
             else:
                 weight = (1.0 - changes[g]) * score_cue(paper, cues, n, offset[g], table, k, rows)[1]
             for r in range(RESIDUALS):
-                if rows[r, 1] == 0.0 and rows[r, 2] == 0.0 and rows[r, 3] == 0.0:  # says nothing
-                    continue
-                u, v = rows[r, 1], rows[r, 2]
-                turn = rows[r, 3] + u * across - v * along
-                sample_row(v * s - u * c, -u * s - v * c, turn, rows[r, 4], k, theta, table, moment, row)
-                row[LENGTH] += rows[r, 6] * k / (num - 1.0)
-                add_residual(weight, rows[r, 0], row, rows[r, 5], 6 + g, gradient, hessian, full)
+                for j in range(1, LOCAL):
+                    local[j] -= weight * rows[r, 0] * rows[r, j]
+                if full:
+                    chain(rows[r], c, s, along, across, k, theta, table, moment, row)
+                    add_square(weight, row, rows[r, 5], 6 + g, hessian)
+        chain(local, c, s, along, across, k, theta, table, moment, row)
+        gradient[6 + g] += local[5]
+        for i in range(6):
+            gradient[i] += row[i]
     return height.sum()
 
 
 @nb.njit(error_model="numpy")
-def add_residual(weight, residual, row, by_offset, o, gradient, hessian, full):  # type: ignore[no-untyped-def]
-    """One residual with slopes row (6,) in the course and `by_offset` in number o."""
-    gradient[o] -= weight * residual * by_offset
+def chain(local, c, s, along, across, k, theta, table, moment, row):  # type: ignore[no-untyped-def]
+    """Slopes in the local numbers of a cue about sample k, local (LOCAL,), become slopes in theta, row (6,)."""
+    u, v = local[1], local[2]
+    turn = local[3] + u * across - v * along
+    sample_row(v * s - u * c, -u * s - v * c, turn, local[4], k, theta, table, moment, row)
+    row[LENGTH] += local[6] * k / (len(table) - 1.0)
+
+
+@nb.njit(error_model="numpy")
+def add_square(weight, row, by_offset, o, hessian):  # type: ignore[no-untyped-def]
+    """weight J J^T of one residual, J = row (6,) in the course and `by_offset` in number o, to the lower half."""
+    hessian[o, o] += weight * by_offset**2
     for i in range(6):
-        gradient[i] -= weight * residual * row[i]
-    if full:
-        hessian[o, o] += weight * by_offset**2
-        for i in range(6):
-            hessian[o, i] += weight * by_offset * row[i]
-            for j in range(i + 1):
-                hessian[i, j] += weight * row[i] * row[j]
+        hessian[o, i] += weight * by_offset * row[i]
+        for j in range(i + 1):
+            hessian[i, j] += weight * row[i] * row[j]
 
 
 @nb.njit(error_model="numpy")

@@ -25,6 +25,8 @@ class Figure(NamedTuple):
 
     @property
     def target(self) -> str:
+        if self.at_least is not None and self.at_most is not None:
+            return f"{self.at_least:g} to {self.at_most:g}"
         if self.at_least is not None:
             return f">= {self.at_least:g}"
         return "" if self.at_most is None else f"<= {self.at_most:g}"
@@ -33,7 +35,8 @@ class Figure(NamedTuple):
         """Whether a value reaches the target; None without a target or a value."""
         if value is None or not self.target:
             return None
-        return value >= self.at_least if self.at_least is not None else value <= self.at_most
+        high = self.at_least is None or value >= self.at_least
+        return bool(high and (self.at_most is None or value <= self.at_most))
 
 
 class Value(NamedTuple):

@@ -78,7 +78,7 @@ FIXED = Measurement(
         ),
         *(
             Figure(f"cover90_{distance:.0f}", "share", f"{SCENES}: true course inside the central 90 % of the draws "
-                   f"{distance:.0f} m ahead; must not exceed .93 either", at_least=0.87)
+                   f"{distance:.0f} m ahead", at_least=0.87, at_most=0.93)
             for distance in TOLD
         ),
     ),

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -130,6 +130,10 @@ def run(
     latents, for an init outside the prior's support, and for knobs that this model's way has not."""
     begin = time.perf_counter()
     _check_continuation(continuation)
+    if num_draws < 1:
+        raise InputError(f"num_draws is {num_draws}; least squares needs 1 or more")
+    if init is not None and not isinstance(init, Mapping):
+        raise InputError(f"init is {init!r}; give a value for each site, {{site: value}}")
     if isinstance(model, HasSquares):
         if len(continuation) > 1:
             raise InputError("continuation is not for models with squares(); leave it at [1.0]")

@@ -204,7 +204,10 @@ def run(
     Raises InputError where the model lacks moves, a start or a kernel that is asked for."""
     began = time.perf_counter()
     if not hasattr(model, "moves"):
-        raise InputError(f"rjmcmc needs a model with moves(), but {type(model).__name__} has none")
+        raise InputError(
+            f"rjmcmc needs a model with moves(), but {type(model).__name__} has none; where all its numbers are "
+            "continuous, use importance, smc or nuts"
+        )
     if start == "data" and init is None and not hasattr(model, "start"):
         raise InputError(
             f"start=data needs a model with start(), but {type(model).__name__} has none; "

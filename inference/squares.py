@@ -86,6 +86,10 @@ def minimise(
 
     Where steps are refused again and again, damping grows until none promises much: that is converged only if an
     undamped step does not promise more than STALL either."""
+    if charted := [name for name in learn if name in squares.charts]:
+        raise InputError(
+            f"learn names {', '.join(charted)}, whose numbers have no prior scale of their own; leave it out"
+        )
     unknown = [name for name in learn if name not in squares.sites]
     if unknown:
         raise InputError(f"learn names {', '.join(unknown)}, but the latents are {', '.join(squares.sites)}")
@@ -163,6 +167,8 @@ def run(
         missing = sorted(squares.sites.keys() - init.keys())
         raise InputError(f"init has no value for {missing}; it holds {sorted(init)}")
     x = np.zeros(len(squares.loc)) if init is None else (squares.pack(init) - squares.loc) / squares.scale
+    if not np.isfinite(x).all():
+        raise InputError(f"init is {init}, which is not finite; give a state that the prior reaches")
     knobs: dict[str, Any] = {"num_steps": num_steps, "damping": damping, "tolerance": tolerance, "learn": learn}
     path = minimise(squares, x, **knobs, began=began)
     noise = np.random.default_rng(np.random.SeedSequence(seed)).standard_normal((num_draws, len(x)))

@@ -13,6 +13,7 @@ keeps the local ones apart, so that Rao-Blackwellisation by `depends` stays as s
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -133,6 +134,8 @@ def _numbers(factors: Factors, init: dict[str, Any] | None) -> Array:
     """init in whitened numbers (D,)."""
     if init is None:
         return np.zeros(factors.depends.shape[1])
+    if not isinstance(init, Mapping):
+        raise InputError(f"init is {init!r}; give a value for each site, {{site: value}}")
     if missing := sorted(factors.sites.keys() - init.keys()):
         raise InputError(f"init has no value for {missing}; it holds {sorted(init)}")
     x = factors.whiten(init)

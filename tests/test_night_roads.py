@@ -78,7 +78,7 @@ def test_negative_seeds_are_refused(scenario: object) -> None:
 
 
 def test_shares_and_angles_that_are_none_are_refused() -> None:
-    with pytest.raises(InputError, match=r"clutter is 1\.5 and yaw is 0\.0; give a share and an angle"):
+    with pytest.raises(InputError, match=r"clutter is 1\.5; give a share from 0 to 1"):
         night_road(clutter=1.5)
 
 

@@ -18,10 +18,11 @@ from models.clothoid import Clothoid, evaluate, hermite, sample
 from models.program import InputError, log_joint, simulate
 from models.road.along_road import CuesAlongRoad
 from models.road.course import RoadCourse
+from models.road.cue_kernel import normal_share
 from models.road.evidence import RoadEvidence
 from models.road.kernel import NO_ROAD
 from models.road.numbers import log_volumes, number_moments, to_courses, to_numbers
-from models.road.prior import course_moments
+from models.road.prior import CoursePrior, course_moments
 
 Floats = NDArray[np.float64]
 EXACT, PURE = RoadCourse(clutter=0.1, lane_changes=0.2), RoadCourse(clutter=0.0, lane_changes=0.0)
@@ -169,6 +170,60 @@ def natural(x: Tensor) -> tuple[Tensor, Tensor]:
     return course, loc + std * x[..., 6:]
 
 
+@pytest.mark.parametrize("prior", [CoursePrior(length=300.0), CoursePrior(curvature_std=0.01)])
+def test_wide_priors_have_the_density_of_the_program_or_none(prior: CoursePrior) -> None:
+    """Numbers of clothoids that wind about between ends which a shorter one joins are no roads."""
+    model = RoadCourse(prior=prior)
+    factors = model.factors(EVIDENCE)
+    x = np.random.default_rng(0).standard_normal((300, 6 + GROUPS))
+    height = factors.evaluate(x).sum(-1)
+    there = height > 0.5 * NO_ROAD
+    assert 0.2 < there.mean() < 1.0
+    latents = {n: torch.from_numpy(v) for n, v in factors.latents(x[there]).items()}
+    volume = log_volumes(x[there, :6], prior) + np.log(EVIDENCE.offset_std).sum()
+    white = 0.5 * (x[there] ** 2 + np.log(2 * np.pi)).sum(-1)
+    expected = log_joint(model, latents, EVIDENCE).numpy() + volume + white
+    np.testing.assert_allclose(height[there], expected, rtol=1e-6)
+
+
+def test_priors_whose_roads_turn_back_are_refused_by_name() -> None:
+    with pytest.raises(InputError, match=r"has roads that turn back.*lower its length, curvature_std or rate_std"):
+        RoadCourse(prior=CoursePrior(length=400.0, curvature_std=0.02)).factors(EVIDENCE)
+
+
+def test_hessian_of_the_course_s_own_factor_is_that_of_finite_differences() -> None:
+    """At the mean of C, where what Gauss and Newton leave out is the curvature of the volume alone."""
+    blind = EVIDENCE._replace(**{name: getattr(EVIDENCE, name)[:0] for name in OF_CUES})
+    squares, size = PURE.squares(blind), 6 + GROUPS
+    x, step = np.r_[to_numbers(course_moments(PURE.prior)[0], PURE.prior), np.zeros(GROUPS)], 1e-4
+    hessian, gradient = np.empty((size, size)), np.empty(size)
+    slopes = np.empty((size, size))
+    for i in range(6):
+        ahead, back = np.empty(size), np.empty(size)
+        for sign, slope in ((1.0, ahead), (-1.0, back)):
+            squares.evaluate(squares.loc + squares.scale * (x + sign * step * np.eye(size)[i]), hessian, slope)
+        slopes[i] = (ahead - back) / (2.0 * step)
+    squares.evaluate(squares.loc + squares.scale * x, hessian, gradient)
+    np.testing.assert_allclose(symmetric(hessian)[:6, :6], slopes[:6, :6], atol=0.05)
+
+
+def test_the_end_of_sight_weighs_by_its_own_curvature() -> None:
+    """Minus the second derivative of log Phi by differences, near and far beyond where it underflows."""
+    for x in (-1e4, -50.0, -30.1, -29.9, -3.0, 0.0, 2.0, 6.0):
+        step = 1e-3 * max(1.0, abs(x) * 1e-3)
+        below, here, above = (normal_share(x + d) for d in (-step, 0.0, step))
+        assert here[1] == pytest.approx((above[0] - below[0]) / (2 * step), rel=1e-5)
+        assert here[2] == pytest.approx(-(above[1] - below[1]) / (2 * step), rel=1e-4, abs=1e-9)
+
+
+def test_cues_far_beyond_the_sight_leave_gradients_finite() -> None:
+    tight = EVIDENCE._replace(covariance=np.broadcast_to(1e-6 * np.eye(2), EVIDENCE.covariance.shape).copy())
+    for reach in (1.0, 1e-3):
+        model = RoadCourse(reach=reach, reach_std=1e-4)
+        height, gradient = model.factors(tight).gradient(numbers(8))
+        assert np.isfinite(height).all() and np.isfinite(gradient).all()
+
+
 def test_numbers_and_courses_are_inverse_and_volumes_are_those_of_autograd() -> None:
     whole = torch.from_numpy(numbers(6))
     x = whole.numpy()[:, :6]
@@ -248,6 +303,36 @@ def test_hessian_is_the_covariance_of_the_slope(reach: float) -> None:
     error = products.std(0) / math.sqrt(num)
     assert np.all(np.abs(scores.mean(0)) < 4.5 / math.sqrt(num) + 0.1)
     assert np.all(np.abs(products.mean(0) - scale * mean * scale[:, None]) < 4.5 * error)
+
+
+def test_vehicles_change_lanes_with_all_their_detections_and_as_far_as_said() -> None:
+    """Of 4000 simulated scenes: the share of vehicles with a detection beyond 4 sd of those that stay, and the spread
+    and turn of those that leave. Standard errors times 4."""
+    num, model = 4000, dataclasses.replace(PURE, lane_changes=0.5, reach=math.inf)
+    tight = EVIDENCE._replace(
+        cues=None,
+        covariance=np.broadcast_to(1e-8 * np.eye(2), EVIDENCE.covariance.shape).copy(),
+        spread=np.full(len(EVIDENCE.group), 1e-3),
+        arc=np.linspace(5.0, 150.0, len(EVIDENCE.group)),
+    )
+    course, offset = (v[0] for v in natural(torch.zeros(1, 6 + GROUPS, dtype=torch.float64)))
+    torch.manual_seed(3)
+    along = CuesAlongRoad(model, tight, course.expand(num, 6), offset.expand(num, GROUPS))
+    seen = along.sample()
+    aside = seen[..., 1].numpy() - offset.numpy()[tight.group]  # the road is straight and along x
+    leaves = np.abs(aside) > 0.02  # 20 sd of those that stay; those that leave are nearer by chance in 1 of 120
+    group = int(np.flatnonzero(np.bincount(tight.group[tight.moves], minlength=GROUPS) > 1)[0])
+    mine = leaves[:, tight.group == group]
+    assert np.abs(mine.any(1).mean() - 0.5) < 4 * 0.5 / math.sqrt(num)
+    gone = mine.any(1)
+    assert mine[gone].mean() > 0.98  # all of them, or none
+    assert not leaves[:, ~tight.moves].any()
+    far = aside[:, tight.group == group][gone]
+    turned = seen[..., 2].numpy()[:, tight.group == group][gone] - tight.turn[tight.group == group]
+    std = np.hypot(tight.flow_spread, tight.flow_std)[tight.group == group]
+    assert far.std() == pytest.approx(model.change_std, rel=4 / math.sqrt(far.size))
+    for column, own in zip(turned.T, std, strict=True):
+        assert column.std() == pytest.approx(math.hypot(own, model.change_turn), rel=4 / math.sqrt(2 * len(column)))
 
 
 def seen_arcs(rng: np.random.Generator, num: int, reach: float) -> Floats:

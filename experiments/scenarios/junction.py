@@ -69,7 +69,7 @@ def find(data_root: str, kind: str, ending: str, instead: str = "protocol") -> d
     files = {path.name.removesuffix(ending): path for path in sorted(folder.glob(f"*{ending}"))}
     if not files:
         raise InputError(
-            f"no {kind} in '{folder.resolve()}'; set scenario.data_root to the folder that holds "
+            f"no {kind} in '{Path(data_root).resolve()}'; set scenario.data_root to the folder that holds "
             f"'{kind}', or run scenario={instead}, which needs no files"
         )
     return files

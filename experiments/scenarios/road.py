@@ -60,8 +60,10 @@ def night_road(
     The truth holds `course` (6,) and `offset` (G,) as the model's sites do, and `line` (M, 3): x, y, heading of the
     course every half metre. Raises InputError for a negative seed and shares that are none."""
     _check("night_road", seed)
-    if not 0 <= clutter <= 1 or not 0 <= yaw < np.inf:
-        raise InputError(f"scenario night_road: clutter is {clutter} and yaw is {yaw}; give a share and an angle >= 0")
+    if not 0 <= clutter <= 1:
+        raise InputError(f"scenario night_road: clutter is {clutter}; give a share from 0 to 1")
+    if not 0 <= yaw < np.inf:
+        raise InputError(f"scenario night_road: yaw is {yaw}; give an angle of 0 rad or more")
     streams = np.random.SeedSequence(seed).spawn(7)
     where, layout = random_layout(np.random.default_rng(streams[0]))
     mean, tril = course_moments(MODEL.prior)

@@ -47,6 +47,7 @@ from models.road.prior import USUAL_ROADS, CoursePrior, course_moments
 
 Floats = NDArray[np.float64]
 FIRST_ROADS = (8, 2)  # places and directions of the end that a start is the best of
+SUSPECT = 0.5  # a vehicle that rather leaves the road than follows it
 FOGS = (3.0, 1.0, 0.4)  # [m]
 
 
@@ -72,6 +73,9 @@ class RoadCourse:
     def __post_init__(self) -> None:
         if self.likelihood not in ("exact", "paper"):
             raise InputError(f"likelihood is '{self.likelihood}'; choose 'exact' or 'paper'")
+        for kind in self.extra_kinds:
+            if not isinstance(kind, CueKind):
+                raise InputError(f"extra_kinds holds {kind!r}; give each kind as a models.road.cues.CueKind")
         if not 0 <= self.clutter < 1:
             raise InputError(f"clutter is {self.clutter}; give a share in [0, 1)")
         if not 0 <= self.lane_changes < 1:
@@ -173,20 +177,21 @@ class RoadCourse:
         return hyper(self, scenes, names)
 
     def follows(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> Floats:
-        """Probability (N,) of each cue to follow the road, the mean over draws of course (S, 6) and offset (S, G)."""
+        """Probability (N,) of each cue to follow the road, the mean over draws of course (S, 6) and offset (S, G) that
+        are roads."""
         course, offset = (torch.from_numpy(np.ascontiguousarray(draws[site])) for site in ("course", "offset"))
         assert evidence.cues is not None
-        return CuesAlongRoad(self, evidence, course, offset).whitened(evidence.cues)[..., 2].mean(0).numpy()
+        return CuesAlongRoad(self, evidence, course, offset).whitened(evidence.cues)[..., 2].nanmean(0).numpy()
 
     def remarks(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> list[str]:
         """Vehicles that rather change lanes, or turn off, than follow the road, in words."""
         follows = self.follows(evidence, draws)
         shares = {int(g): follows[evidence.group == g].mean() for g in np.unique(evidence.group[evidence.moves])}
         return [
-            f"{evidence.names[g]} follows the road with a probability of only {share:.2f}: it changes lanes or turns "
-            "off, and counts for little"
+            f"{evidence.names[g]} changes lanes or turns off (it follows the road with a probability of {share:.2g}) "
+            "and counts for little"
             for g, share in shares.items()
-            if share < 0.5
+            if share < SUSPECT
         ]
 
     def _kernel(self, evidence: RoadEvidence) -> tuple[Any, ...]:

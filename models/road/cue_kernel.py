@@ -104,12 +104,12 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     turn = wrap(cues[n, FLOW] - table[k, HEADING] - q - cues[n, TURN]) * precision
     log_road, weight = constant - 0.5 * (e * e + turn * turn), 1.0
     skew = norm * (my * sx - mx * sy)  # t' Sigma m
-    slant, blur, sight, log_seen = skew / variance, 1.0, math.inf, 0.0
+    slant, blur, sight, mills, bent = skew / variance, 1.0, math.inf, 0.0, 0.0
     if cues[n, REACH] < math.inf:
         blur = math.sqrt(cues[n, BLUR] + cues[n, SXX] + cues[n, SYY] - (variance - spread) - slant * skew)
         sight = (cues[n, REACH] - table[k, ARC] - along + slant * lateral) / blur
     if sight < FAR_INSIDE:
-        log_seen = log_normal_share(sight)
+        log_seen, mills, bent = normal_share(sight)
         log_road += log_seen
     if clutter > 0.0:
         road = root * math.exp(log_road)
@@ -128,14 +128,13 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * precision, -precision
     rows[2, 4] = -along * precision
     if sight < FAR_INSIDE:
-        inverse_mills = math.exp(-0.5 * sight * sight - LOG_ROOT - log_seen)
-        pull = math.sqrt(inverse_mills * (sight + inverse_mills))  # of the curvature of log Phi
+        pull = math.sqrt(bent)
         unlike = 2.0 * (variance - spread) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
         slant_turn = (unlike + 2.0 * slant * skew) / variance  # d slant / d heading
         blur_turn = 2.0 * (skew - slant * unlike - slant * slant * skew)  # d blur^2 / d heading
         by_turn = (slant_turn * lateral - 0.5 * sight * blur_turn / blur) / blur
         scale = pull / blur
-        rows[3, 0] = -inverse_mills / pull
+        rows[3, 0] = -mills / pull
         rows[3, 1], rows[3, 2] = -scale * (1.0 + slant * q) + pull * by_turn * norm * bend, scale * slant
         rows[3, 3], rows[3, 5], rows[3, 6] = pull * by_turn, -scale * slant, -scale
         rows[3, 4] = -0.5 * scale * slant * along * along + pull * by_turn * norm * along
@@ -143,12 +142,16 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
 
 
 @nb.njit(error_model="numpy")
-def log_normal_share(x):  # type: ignore[no-untyped-def]
-    """log Phi(x)."""
+def normal_share(x):  # type: ignore[no-untyped-def]
+    """log Phi(x), its slope phi / Phi, and minus its second derivative."""
     if x > -30.0:  # past that erfc underflows
-        return math.log(0.5 * math.erfc(-x * ROOT_HALF))
+        log_share = math.log(0.5 * math.erfc(-x * ROOT_HALF))
+        slope = math.exp(-0.5 * x * x - LOG_ROOT - log_share)
+        return log_share, slope, slope * (x + slope)
     y = 1.0 / (x * x)
-    return -0.5 * x * x - math.log(-x) - LOG_ROOT + math.log1p(-y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y))))
+    series = -y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y)))
+    log_share = -0.5 * x * x - math.log(-x) - LOG_ROOT + math.log1p(series)
+    return log_share, -x / (1.0 + series), -x * x * series / (1.0 + series) ** 2
 
 
 @nb.njit(error_model="numpy")

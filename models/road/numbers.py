@@ -26,25 +26,46 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from models.clothoid import hermite
-from models.clothoid_kernel import CURVATURE, HEADING, LENGTH, NODES, RATE, WEIGHTS, X, Y, hermite_one
+from models.clothoid import hermite_or_inf
+from models.clothoid_kernel import (
+    CURVATURE,
+    HEADING,
+    LENGTH,
+    MAX_STRETCH,
+    NODES,
+    RATE,
+    WEIGHTS,
+    X,
+    Y,
+    guess_bow,
+    hermite_one,
+)
 from models.program import InputError
 from models.road.prior import CoursePrior, course_moments
 
 Floats = NDArray[np.float64]
 ORDER = 3  # of the quadrature of the moments: exact to the fifth power of C
+NEAR_GUESS = 0.65  # [rad] about the guess of the Hermite fit, which is within 0.6 of the bow it finds
 SHORTEST = 1.0  # [m]: a shorter course is none
 
 
 @functools.lru_cache
 def number_moments(prior: CoursePrior) -> tuple[Floats, Floats]:
-    """Mean (6,) of theta and the lower Cholesky factor (6, 6) of its covariance, where C follows its prior."""
+    """Mean (6,) of theta and the lower Cholesky factor (6, 6) of its covariance, where C follows its prior.
+
+    Raises InputError for a prior whose roads turn back."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(ORDER)
     unit = np.array(list(itertools.product(nodes, repeat=6)))
     weight = np.prod(list(itertools.product(weights / weights.sum(), repeat=6)), -1)
     mean, tril = course_moments(prior)
     start, end = torch.from_numpy(mean + unit @ tril.T).split(3, -1)
-    theta = torch.stack(tuple(hermite(start, end)), -1).numpy()
+    found = hermite_or_inf(start, end)
+    if torch.isinf(found.length).any():
+        raise InputError(
+            f"the prior of the course has roads that turn back, which no clothoid of start and end tells: {prior}; "
+            "lower its length, curvature_std or rate_std"
+        )
+    theta = torch.stack(tuple(found), -1).numpy()
     centre = weight @ theta
     return centre, np.linalg.cholesky(((theta - centre) * weight[:, None]).T @ (theta - centre))
 
@@ -115,6 +136,16 @@ def end_of(theta, moment, turn, course):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
+def is_shortest(theta, moment, turn):  # type: ignore[no-untyped-def]
+    """Whether theta is the clothoid that the Hermite fit gives to its ends, and not one that winds about instead."""
+    chord, along = math.hypot(moment[0, 0], moment[0, 1]), math.atan2(moment[0, 1], moment[0, 0])
+    p, q, bow = -along, turn - along, 0.5 * theta[RATE] * theta[LENGTH] ** 2
+    if not theta[LENGTH] <= MAX_STRETCH * chord or abs(p) > math.pi or abs(q) > math.pi:
+        return False
+    return abs(bow - guess_bow(p, q)) < NEAR_GUESS
+
+
+@nb.njit(error_model="numpy")
 def cross(a, b, out):  # type: ignore[no-untyped-def]
     """a x b into out (3,)."""
     out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
@@ -167,7 +198,7 @@ def course_density(theta, mean, root, gradient, hessian):  # type: ignore[no-unt
     moment, columns, course, white = np.empty((5, 2)), np.empty((3, 3)), np.empty(6), np.empty(6)
     turn = moments_of(theta, moment)
     det = end_columns(theta, moment, turn, columns)
-    if not det > 0.0:
+    if not det > 0.0 or not is_shortest(theta, moment, turn):
         return -np.inf
     end_of(theta, moment, turn, course)
     height = math.log(det) - 3.0 * math.log(2.0 * math.pi)

@@ -297,7 +297,10 @@ def sentence(held: Held) -> str:
 
     gain = np.asarray(held.gain, dtype=float)
     error = gain.std(ddof=1) / len(gain) ** 0.5
-    return f"log evidence of a held-out scene {gain.mean():+.2f} ± {error:.2f} nats against the configured settings"
+    told = f"log evidence of a held-out scene {gain.mean():+.2f} ± {error:.2f} nats against the configured settings"
+    if gain.mean() < 2.0 * error:
+        return f"{told}: no proven gain; keep the configured settings, or learn from more scenes"
+    return told
 
 
 def figure(rows: list[Row], learnt: Learnt) -> Figure:

@@ -237,13 +237,22 @@ def lateral(tables: Floats, steps: Floats, points: Floats, out: Floats) -> None:
 def metrics(posterior: Posterior, scene: Scene) -> dict[str, float]:
     """`check_course` of a posterior of roads, for the report; nothing without a true line.
 
-    error_40_m ..       distance of the true course from the estimate at 40, 80 and 140 m
-    spread_40_m ..      its posterior standard deviation
-    covered_40 ..       1 where the 90 % band there holds the truth
-    inside_mid ..       1 where the estimate is inside the tube to 140 m
-    range_m             calibrated range, 0 where even the first metres are not trusted
-    trusted_true        1 where the estimate is inside the mid tube up to there, 0 where not, nan for an abstention
-    coverage            share of the ranges where the 90 % band holds the truth"""
+    error_40_m    distance of the true course from the estimate 40 m ahead
+    error_80_m    the same 80 m ahead
+    error_140_m   the same 140 m ahead
+    spread_40_m   posterior standard deviation of that distance 40 m ahead
+    spread_80_m   the same 80 m ahead
+    spread_140_m  the same 140 m ahead
+    covered_40    1 where the 90 % band holds the truth 40 m ahead, else 0
+    covered_80    the same 80 m ahead
+    covered_140   the same 140 m ahead
+    inside_tight  1 where the estimate is nearer to the truth than .4 m + .006 r at all ranges r to 140 m, else 0
+    inside_mid    the same, .6 m + .010 r: the mid tube
+    inside_wide   the same, .8 m + .015 r: the wide tube
+    range_m       calibrated range: how far the estimate is to be trusted to stay inside the mid tube; 0 for not at all
+    trusted_true  1 where it does stay inside up to its calibrated range, 0 where not, none where nothing is offered
+    coverage      share of the ranges where the 90 % band holds the truth
+    """
     if scene.truth is None or not has_road(posterior):
         return {}
     found = check_course(posterior, scene.truth["line"])

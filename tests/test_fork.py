@@ -146,6 +146,14 @@ def test_with_one_course_the_density_is_that_of_the_road_course(model: ForkedRoa
     np.testing.assert_allclose(back, z["main"], rtol=1e-9, atol=1e-12)
 
 
+def test_two_courses_that_run_together_have_the_density_of_one() -> None:
+    """With sight and changes of lanes, whatever share the second has."""
+    z = near_truth(40, 4) | {"bend": torch.zeros(40, 2, dtype=torch.float64)}
+    one, two = (z | {"num_courses": torch.full((40,), num)} for num in (1, 2))
+    assert EVIDENCE.moves.any()
+    np.testing.assert_allclose(log_prob(MODEL, two), log_prob(MODEL, one), rtol=1e-6)
+
+
 def turned_round(z: Latents) -> tuple[Latents, RoadEvidence]:
     """One state and its scene as they look to a car at the end of the road that drives back."""
     assert EVIDENCE.cues is not None

@@ -18,9 +18,12 @@ from experiments.road_metrics import (
     RoadCheck,
     at_ranges,
     check_course,
+    estimated_road,
     half_width,
     lateral_offsets,
+    lay_courses,
     metrics,
+    road_points,
     trusted_range,
 )
 from experiments.scenarios.road import night_rural
@@ -52,6 +55,24 @@ def test_distances_from_an_arc_are_those_from_its_circle() -> None:
     points = np.stack([(radius - inward) * np.sin(angles), radius - (radius - inward) * np.cos(angles)], -1)
     # inward is left; at d = 6 m the parabola through a sample b = 2 m away is off by b^2 d k^2 / 2 = .3 mm
     np.testing.assert_allclose(lateral_offsets(course[None], points)[0], inward, atol=5e-4)
+
+
+def test_the_estimate_of_courses_that_end_here_and_there_lies_on_their_bend() -> None:
+    """Arcs of one circle: the mean of their ends lies inside it by 1.1 m, the mean of their numbers on it."""
+    radius = 150.0
+    turn = np.array([1.0, 1.1, 1.2, 1.3])
+    ends = np.stack([radius * np.sin(turn) - 10.0, radius * (1.0 - np.cos(turn)), turn], -1)
+    courses = np.concatenate([np.broadcast_to([-10.0, 0.0, 0.0], (4, 3)), ends], 1)
+    points = road_points(estimated_road(of_courses(courses)))[:25]
+    from_centre = np.hypot(points[:, 0] + 10.0, points[:, 1] - radius)
+    assert np.abs(from_centre - radius).max() < 0.02
+    heavy = road_points(estimated_road(of_courses(courses, np.array([0.0, -50.0, -50.0, -50.0]))))
+    np.testing.assert_allclose(heavy, road_points(lay_courses(courses[:1])), atol=1e-6)
+
+
+def test_draws_that_are_no_roads_have_no_part_in_the_estimate() -> None:
+    mixed = np.concatenate([shifted(0.4), np.zeros((1, 6))])
+    assert road_points(estimated_road(of_courses(mixed)))[:, 1] == pytest.approx(0.4)
 
 
 def test_ends_that_no_clothoid_joins_are_infinitely_far() -> None:

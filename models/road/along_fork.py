@@ -3,10 +3,10 @@
 Things are what is detected: a static cue is one, all detections of a vehicle are one. Each follows one of the courses,
 which one is unknown and summed out,
 
-    p(cues) = prod_things sum_c share_c prod_(n of the thing) p(cue_n | course c, offset)
+    p(cues) = prod_things sum_c share_c p(cues of the thing | course c, offset)
 
-with p(cue | course, offset) of models.road.cue_kernel, clutter included. Where both courses run together it makes no
-difference which one a cue follows, and with one course this is models.road.along_road.
+with the density of models.road.cue_kernel, clutter and changes of lanes included. Where both courses run together it
+makes no difference which one a cue follows, and with one course this is models.road.along_road.
 
 There are no derivatives: engines that need some take differences.
 """
@@ -125,7 +125,7 @@ def kernel_data(model: ForkedRoad, evidence: RoadEvidence, cues: Floats) -> tupl
 
 
 def sampled_courses(model: ForkedRoad, fork: Fork) -> tuple[Floats, Floats]:
-    """Samples of both courses, (S, num, 6) each, columns as in models.clothoid_kernel. The second means nothing
+    """Samples of both courses, (S, num, 7) each, columns as in models.clothoid_kernel. The second means nothing
     where there is none."""
     z = packed(fork, fork.main[..., :0])
     first, second = np.empty((2, len(z), model.road.num_samples, COLUMNS))

@@ -15,7 +15,7 @@ import numpy as np
 from models.clothoid_kernel import ARC, BEND, COLUMNS, COS, CURVATURE, HEADING, RATE, SIN, X, Y, sample_one
 from models.clothoid_kernel import LENGTH as LENGTH_OF
 from models.intersection.window import window
-from models.road.cue_kernel import CHANGES, LOCAL, WIDTH, exact_cue, nearest_sample, score_cue, with_changes
+from models.road.cue_kernel import WIDTH, find_samples, score_groups
 
 # a packed state: number of courses, whether the second joins, length shared, what its curvature and rate have more;
 # lateral and heading of the start of the main course, curvature, rate; offsets
@@ -99,30 +99,22 @@ def log_likelihood(z, floats, ints, odds):  # type: ignore[no-untyped-def]
     groups, num_cues, num, things = ints[GROUPS], ints[CUES], ints[SAMPLES], ints[THINGS]
     cues = window(floats, SETTINGS + 2 * groups, (num_cues, WIDTH))
     group, thing = window(ints, COUNTS, (num_cues,)), window(ints, COUNTS + num_cues, (num_cues,))
-    first, second, rows = np.empty((num, COLUMNS)), np.empty((num, COLUMNS)), np.empty((0, LOCAL))
+    first, second, near = np.empty((num, COLUMNS)), np.empty((num, COLUMNS)), np.empty(num_cues, np.int64)
     paper, forks, step = ints[PAPER] == 1, z[COURSES] == 2.0, lay_first(z, floats, first)
     if forks:
         lay_second(z, first, step, second)
-    along, leaves, chance, total = np.zeros((things, 2)), np.zeros((things, 2)), np.zeros(things), 0.0
+    along, offset, changes, total = np.zeros((2, things)), np.empty(things), np.empty(things), 0.0
     for n in range(num_cues):
-        o, t = z[HEAD + group[n]], thing[n]
-        chance[t] = cues[n, CHANGES]
-        for course in range(2 if forks else 1):
-            table = second if course else first
-            k = nearest_sample(cues, n, table, step)
-            along[t, course] += score_cue(paper, cues, n, o, table, k, rows)[0]
-            if chance[t] > 0.0:
-                leaves[t, course] += exact_cue(cues, n, o, table, k, True, rows)[0]
-    for t in range(things):
-        if chance[t] > 0.0:
-            along[t, 0] = with_changes(chance[t], along[t, 0], leaves[t, 0])[0]
-            if forks:
-                along[t, 1] = with_changes(chance[t], along[t, 1], leaves[t, 1])[0]
+        offset[thing[n]] = z[HEAD + group[n]]
+    for course in range(2 if forks else 1):
+        table = second if course else first
+        find_samples(cues, table, step, near)
+        score_groups(paper, cues, thing, near, offset, table, along[course], changes)
     for t in range(things):
         if not forks:
-            total += along[t, 0]
+            total += along[0, t]
             continue
-        one, other = along[t, 0] + math.log(1.0 - floats[SHARE]), along[t, 1] + math.log(floats[SHARE])
+        one, other = along[0, t] + math.log(1.0 - floats[SHARE]), along[1, t] + math.log(floats[SHARE])
         total += max(one, other) + math.log1p(math.exp(-abs(one - other)))
         if len(odds) > 0:
             odds[t] = other - one

@@ -7,9 +7,10 @@ data-trained counterparts".
     beta_static, beta_vehicle, beta_flow    weights of the paper's likelihood, in place of clutter and strays; log
     prior.curvature_std and others          of the course (`OF_COURSE`); log
 
-Only what some scene shows can be learnt. The density of a scene's draws z = (course, offset) under other settings is
+Only what some scene shows can be learnt; the end of the sight and changes of lanes are held as configured. The density
+of a scene's draws z = (course, offset) under other settings is
 
-    log p(z, y | h) = log p(course | h) + sum_g log N(offset_g; mean_g, std_g^2) + sum_n log p(cue_n | z, h) + const
+    log p(z, y | h) = log p(course | h) + sum_g [log N(offset_g; mean_g, std_g^2) + log p(cues of g | z, h)] + const
 
 where the sample of the course that is nearest to a cue does not depend on h and is found once.
 

@@ -38,7 +38,7 @@ class CoursePrior:
     curvature_std: float = 1 / 400  # [1/m]
     rate_std: float = 1 / 36000  # [1/m^2]; a bend of 400 m after 90 m
     length: float = 155.0  # [m]
-    length_std: float = 1.0  # [m]
+    length_std: float = 1.0  # of roads; the moments of C, in which bends shorten the chord, imply about 10 [m]
 
     def __post_init__(self) -> None:
         for field in fields(self):

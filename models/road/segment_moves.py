@@ -111,7 +111,8 @@ def reaches(node, order, num, table, step, bend, turn, right, up):  # type: igno
 @nb.njit(error_model="numpy")
 def linearise(z, floats, ints, table, step, offset, precision, centre):  # type: ignore[no-untyped-def]
     """Precision P (lower triangle) and P m of the linear numbers, given the knots of z, with the cues linearised about
-    a road's samples `table`, a `step` apart, and offsets (G,)."""
+    a road's samples `table`, a `step` apart, and offsets (G,). It makes proposals only, and leaves out the end of the
+    sight and changes of lanes."""
     _, loc, std, _, _, cues = views(floats, ints)
     slots, groups, group, paper = ints[SLOTS], ints[GROUPS], window(ints, GROUP, (ints[CUES],)), ints[PAPER] == 1
     node, order = np.empty((2, slots + 1)), np.empty(slots + 1, np.int64)

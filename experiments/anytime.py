@@ -68,7 +68,13 @@ def jobs_of(words: list[str]) -> tuple[dict[str, Job], int]:
     words = words if keys & {"experiment", "scenario", "model"} else ["experiment=night_road", *words]
     chosen = plan(words if "scenes" in keys else [*words, f"scenes={SCENES}"], USUAL)
     assert chosen.scenes is not None
-    return {task.engine: task.job for task in tasks_of(chosen._replace(scenes=1))}, chosen.scenes
+    jobs = {task.engine: task.job for task in tasks_of(chosen._replace(scenes=1))}
+    for engine, job in jobs.items():
+        if "num_steps" not in job.config["engine"]:
+            raise ConfigError(
+                f"anytime counts iterations, but engine={engine} takes no num_steps; choose one such as bbvi"
+            )
+    return jobs, chosen.scenes
 
 
 def sweep(job: Job, engine: str, num: int) -> Outcomes:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:  # torch and matplotlib take seconds to import: help and skipp
 Engine = Callable[..., "Posterior"]
 Metric = Callable[["Posterior", "Scene"], dict[str, float]]
 Draw = Callable[["Posterior", "Scene"], dict[str, "Figure"]]
+PARTS = {"scenario", "model", "engine"}
+SETTINGS = PARTS | {"seed", "runs", "force", "functionals", "metrics", "figures", "compare_figures"}
 REMARKED = 100  # draws that a model looks at for its remarks
 Functional = Callable[["Posterior"], dict[str, Any]]
 
@@ -205,7 +207,9 @@ def job_of(config: DictConfig, choices: dict[str, str]) -> Job:
 
 
 def _check(settings: dict[str, Any]) -> None:
-    """Raise ConfigError for what would fail late, when the engine has worked for nothing."""
+    """Raise ConfigError for what would fail late, when the engine has worked for nothing, or be read by nobody."""
+    if unknown := sorted(settings.keys() - SETTINGS):
+        raise ConfigError(f"no setting is called '{unknown[0]}'; there are {', '.join(sorted(SETTINGS))}")
     for name, seed in (("seed", settings["seed"]), ("scenario.seed", settings["scenario"].get("seed"))):
         if isinstance(seed, int) and seed < 0:
             raise ConfigError(f"{name} is {seed}; choose 0 or more")

@@ -119,6 +119,7 @@ def test_the_table_ends_with_the_papers_row() -> None:
         (["scenes=none"], "scenes is 'none'"),
         (["scenario.seed=3"], "scenes or scenario.seed, not both"),
         (["engines=[]"], "engines is empty"),
+        (["engines=[nuts]"], "engine=nuts takes no num_steps; choose one such as bbvi"),
         (["engines=[bbvi"], "cannot read the setting 'engines=\\[bbvi'"),
     ],
 )

@@ -58,6 +58,9 @@ def test_a_run_leaves_a_complete_folder_and_an_identical_one_is_skipped(launch: 
 def test_scores_are_explained_by_the_docstrings_of_their_metrics() -> None:
     says = meanings(["centre_error_m", "beta_error_sd"], ["experiments.junction_metrics", "experiments.metrics"])
     assert says == {"centre_error_m": "distance of the centres"}
+    names = ["error_40_m", "covered_140", "inside_tight", "range_m", "trusted_true", "coverage"]
+    roads = meanings(names, ["experiments.road_metrics"])
+    assert list(roads) == names and not any('"' in meaning for meaning in roads.values())
 
 
 def test_the_arms_of_tracks_without_truth_are_told(launch: Command) -> None:
@@ -110,6 +113,7 @@ BAD_SETTINGS = {
     "metrics=foo": "metrics is 'foo'; give a list of functions",
     "metrics=[foo]": "metrics is '['foo']'; give a list of functions",
     "figures=null": "figures is 'None'; give a list of functions",
+    "+foo=1": "no setting is called 'foo'; there are compare_figures, engine,",
     "runs=calls.txt": "runs is 'calls.txt', but nothing can be written in 'calls.txt' (Not a directory)",
     "runs=/proc/absent": "runs is '/proc/absent', but nothing can be written in '/proc'",
 }

@@ -309,6 +309,24 @@ def test_learning_a_site_that_is_not_there_is_one_sentence() -> None:
         least_squares.run(CompiledLine(), SEEN, seed=0, learn=["c", "a", "d"])
 
 
+def test_the_scale_of_a_charted_site_is_not_learnt() -> None:
+    with pytest.raises(InputError, match="learn names a, whose numbers have no prior scale of their own"):
+        least_squares.run(CompiledSkewed(), SEEN, seed=0, learn=["a"])
+
+
+@pytest.mark.parametrize(
+    ("knobs", "sentence"),
+    [
+        ({"num_draws": 0}, "num_draws is 0; least squares needs 1 or more"),
+        ({"init": 3}, "init is 3; give a value for each site"),
+        ({"init": {"a": torch.full((3,), math.nan), "b": torch.zeros(2, 2)}}, "which is not finite"),
+    ],
+)
+def test_knobs_that_no_fit_can_take_are_one_sentence(knobs: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        least_squares.run(CompiledLine(), SEEN, seed=0, **knobs)
+
+
 def test_learning_needs_squares() -> None:
     with pytest.raises(InputError, match=r"^learn needs a model with squares\(\), but Line has none; leave it empty$"):
         least_squares.run(Line(), SEEN, seed=0, learn=["b"])

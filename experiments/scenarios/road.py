@@ -10,6 +10,7 @@ and each option have their own streams, so that an option changes nothing but it
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from experiments.scenarios.road_layout import (
     place_vehicle,
     random_layout,
 )
+from experiments.scenarios.road_sensors import LIDAR, RADAR, Sensor
 from experiments.scenarios.scene import Scene
 from models.clothoid import Clothoid, Points, evaluate, hermite
 from models.program import InputError, quiet_doubles
@@ -47,6 +49,8 @@ def night_road(
     mismatch: bool = False,
     markings: bool = False,
     lane_change: bool = False,
+    radar: bool = False,
+    lidar: bool = False,
 ) -> Scene:
     """A random night road of the model's prior.
 
@@ -56,6 +60,7 @@ def night_road(
     mismatch  the road is a line, a bend and clothoids between, not one clothoid
     markings  both borders of the lane are seen too, to 70 m
     lane_change  one more car is seen, which goes over to the left lane within 60 m
+    radar, lidar  these sensors see the road, too (experiments.scenarios.road_sensors); model=road_course_radar_lidar
 
     The truth holds `course` (6,) and `offset` (G,) as the model's sites do, and `line` (M, 3): x, y, heading of the
     course every half metre. Raises InputError for a negative seed and shares that are none."""
@@ -64,7 +69,7 @@ def night_road(
         raise InputError(f"scenario night_road: clutter is {clutter}; give a share from 0 to 1")
     if not 0 <= yaw < np.inf:
         raise InputError(f"scenario night_road: yaw is {yaw}; give an angle of 0 rad or more")
-    streams = np.random.SeedSequence(seed).spawn(7)
+    streams = np.random.SeedSequence(seed).spawn(9)
     where, layout = random_layout(np.random.default_rng(streams[0]))
     mean, tril = course_moments(MODEL.prior)
     rng = np.random.default_rng(streams[1])
@@ -86,7 +91,10 @@ def night_road(
     if lane_change:
         seen = seen.join(changing_car(line, len(seen.cues.kind), np.random.default_rng(streams[6])))
     info = {"place": where, "clutter": clutter, "yaw": yaw, "mismatch": mismatch, "markings": markings}
-    info["lane_change"] = lane_change
+    for sensor, there, stream in ((RADAR, radar, streams[7]), (LIDAR, lidar, streams[8])):
+        if there:
+            seen = seen.join(see_by(sensor, line, stream))
+    info |= {"lane_change": lane_change, "radar": radar, "lidar": lidar}
     return _scene("night_road", seed, seen, line, info)
 
 
@@ -156,8 +164,17 @@ def see(layout: Layout, line: Line, rng: np.random.Generator, noise: np.random.S
     return see_at(layout, line.at(np.array(layout.arc)), rng, noise)
 
 
-def see_at(layout: Layout, points: Points, rng: np.random.Generator, noise: np.random.SeedSequence) -> Seen:
-    """The same of cues that stand beside points (N,) of any road; their arc lengths do not matter."""
+def see_at(
+    layout: Layout,
+    points: Points,
+    rng: np.random.Generator,
+    noise: np.random.SeedSequence,
+    sensor: Sensor | None = None,
+) -> Seen:
+    """The same of cues that stand beside points (N,) of any road, seen by the camera or by another sensor; their arc
+    lengths do not matter."""
+    model = dataclasses.replace(MODEL, extra_kinds=(sensor.kind,)) if sensor else MODEL
+    covariance = sensor.covariance if sensor else camera
     num = len(layout.kind)
     vehicles = np.array([kind in ("car", "truck") for kind in layout.kind])
     cues = Cues(
@@ -170,15 +187,15 @@ def see_at(layout: Layout, points: Points, rng: np.random.Generator, noise: np.r
         flow_std=np.ones(num),
         confidence=np.ones(num),
     )
-    evidence = MODEL.prepare(cues)
+    evidence = model.prepare(cues)
     offset = evidence.offset_loc + evidence.offset_std * rng.standard_normal(len(evidence.offset_loc))
     aside = offset[evidence.group]
     x, y, heading = (v.numpy() for v in points[:3])
     true = np.stack([x - np.sin(heading) * aside, y + np.cos(heading) * aside], -1)
-    cues = cues._replace(covariance=camera(true, vehicles), flow_std=0.02 + 0.0012 * np.hypot(*true.T))
+    cues = cues._replace(covariance=covariance(true, vehicles), flow_std=0.02 + 0.0012 * np.hypot(*true.T))
     with quiet_doubles(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(noise.generate_state(1)[0]))
-        measured = scatter(points, torch.from_numpy(aside), MODEL.prepare(cues), MODEL).numpy()
+        measured = scatter(points, torch.from_numpy(aside), model.prepare(cues), model).numpy()
     cues = cues._replace(position=measured[:, :2], flow=np.where(vehicles, measured[:, 2], np.nan))
     return Seen(cues, dict(zip(evidence.names, offset.tolist(), strict=True)))
 
@@ -188,6 +205,13 @@ def camera(true: Floats, vehicles: NDArray[np.bool_]) -> Floats:
     distance = np.hypot(*true.T)
     range_std = 0.05 + np.where(vehicles, 0.05 * distance, 0.02 * distance + 0.0003 * distance**2)
     return line_of_sight(true, range_std, 0.02 + 0.002 * distance)
+
+
+def see_by(sensor: Sensor, line: Line, stream: np.random.SeedSequence) -> Seen:
+    """What another sensor sees."""
+    rng, layout = np.random.default_rng(stream), Layout([], [], [], [])
+    place_row(layout, Row(sensor.kind.name, False, sensor.gap), MODEL.prior.behind + sensor.reach, rng)
+    return see_at(layout, line.at(np.array(layout.arc)), rng, stream.spawn(1)[0], sensor)
 
 
 def changing_car(line: Line, track: int, rng: np.random.Generator) -> Seen:
@@ -253,7 +277,7 @@ def _check(name: str, seed: int) -> None:
 
 def _scene(name: str, seed: int, seen: Seen, line: Line, info: dict[str, Any] | None = None) -> Scene:
     """The scene with its truth; the course is where the line starts and ends."""
-    names = MODEL.prepare(seen.cues).names
+    names = dataclasses.replace(MODEL, extra_kinds=(RADAR.kind, LIDAR.kind)).prepare(seen.cues).names
     track = np.stack([v.numpy() for v in line.points[:3]], -1)
     course, offset = np.concatenate([track[0], track[-1]]), np.array([seen.offset[group] for group in names])
     numbers = {"scenario": name, "seed": seed, "cues": len(seen.cues.kind), "groups": len(names)}

@@ -59,6 +59,7 @@ RESIDUALS, LOCAL = (
 )  # of a cue, at most; a residual and its slopes in along, across, heading, curvature, offset, arc
 ROOT_HALF = math.sqrt(0.5)
 LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
+UNDERFLOW = -30.0  # past that erfc does
 FAR_INSIDE = 6.5  # standard deviations of sight from where log Phi is flat
 
 
@@ -102,21 +103,22 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     root = 1.0 / math.sqrt(variance)
     e = lateral * root
     turn = wrap(cues[n, FLOW] - table[k, HEADING] - q - cues[n, TURN]) * precision
-    log_road, weight = constant - 0.5 * (e * e + turn * turn), 1.0
+    height, weight = constant - 0.5 * (e * e + turn * turn), 1.0
     skew = norm * (my * sx - mx * sy)  # t' Sigma m
-    slant, blur, sight, mills, bent = skew / variance, 1.0, math.inf, 0.0, 0.0
+    slant, blur, sight, seen = skew / variance, 1.0, math.inf, 1.0
     if cues[n, REACH] < math.inf:
         blur = math.sqrt(cues[n, BLUR] + cues[n, SXX] + cues[n, SYY] - (variance - spread) - slant * skew)
         sight = (cues[n, REACH] - table[k, ARC] - along + slant * lateral) / blur
     if sight < FAR_INSIDE:
-        log_seen, mills, bent = normal_share(sight)
-        log_road += log_seen
+        seen = 0.5 * math.erfc(-sight * ROOT_HALF) if sight > UNDERFLOW else 0.0
     if clutter > 0.0:
-        road = root * math.exp(log_road)
+        road = root * seen * math.exp(height)
         weight = road / (road + clutter)
         log_density = math.log(road + clutter)
+    elif seen > 0.0:
+        log_density = height + math.log(root * seen)
     else:
-        log_density = log_road + math.log(root)
+        log_density = height + math.log(root) + normal_share(sight)[0]
     if len(rows) == 0:
         return log_density, weight
     rows[:] = 0.0
@@ -128,6 +130,7 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * precision, -precision
     rows[2, 4] = -along * precision
     if sight < FAR_INSIDE:
+        _, mills, bent = normal_share(sight)
         pull = math.sqrt(bent)
         unlike = 2.0 * (variance - spread) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
         slant_turn = (unlike + 2.0 * slant * skew) / variance  # d slant / d heading
@@ -144,7 +147,7 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
 @nb.njit(error_model="numpy")
 def normal_share(x):  # type: ignore[no-untyped-def]
     """log Phi(x), its slope phi / Phi, and minus its second derivative."""
-    if x > -30.0:  # past that erfc underflows
+    if x > UNDERFLOW:
         log_share = math.log(0.5 * math.erfc(-x * ROOT_HALF))
         slope = math.exp(-0.5 * x * x - LOG_ROOT - log_share)
         return log_share, slope, slope * (x + slope)

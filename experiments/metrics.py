@@ -51,6 +51,21 @@ def model_probability(posterior: Posterior, scene: Scene, *, dimension: str) -> 
     return {"true_model_probability": shares.get(int(known(scene)[dimension]), 0.0), f"{dimension}_map": float(best)}
 
 
+def most_probable_count(posterior: Posterior, scene: Scene, *, dimension: str) -> dict[str, float]:
+    """How many slots are probably active, where nobody knows how many there are. Nothing without a model index.
+
+    dimension  the site that counts them
+
+    num_knots_map          most probable number of knots, where one clothoid of a road ends and the next begins
+    num_knots_probability  its posterior probability
+    """
+    if posterior.model_index is None:
+        return {}
+    shares = posterior.model_probabilities()
+    best = max(shares, key=lambda index: shares[index])
+    return {f"{dimension}_map": float(best), f"{dimension}_probability": shares[best]}
+
+
 def known(scene: Scene) -> dict[str, np.ndarray]:
     """The true latents by site; empty where nobody knows."""
     return scene.truth if isinstance(scene.truth, dict) else {}

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2, kstest
 
+from experiments.metrics import most_probable_count
 from experiments.road_figures import figures
 from experiments.road_metrics import check_course, label_free, metrics
 from experiments.scenarios.road import Line, night_road, see
@@ -333,6 +334,8 @@ def test_a_clear_change_is_found_where_it_is_and_one_clothoid_misses_it() -> Non
     evidence, line = even_rows(line_of(sharp), seed=3, gap=8.0), walked(sharp, np.arange(0.0, 155.5, 0.5))
     posterior = rjmcmc.run(ROAD, evidence, seed=5, start="data", num_chains=4, num_steps=4000, warmup=1000, thin=5)
     assert posterior.model_probabilities().get(0, 0.0) < 0.01
+    count = most_probable_count(posterior, SCENE, dimension="num_knots")
+    assert count["num_knots_map"] == 1 and 0.5 < count["num_knots_probability"] <= 1.0
     place = posterior.given(1).draws["knot"][..., 0]
     assert abs(np.median(place) - 75.0) < 3 * place.std() < 60.0
     found, other = (check_course(p, line) for p in (posterior, importance.run(ROAD.course, evidence, seed=5)))

@@ -49,7 +49,7 @@ def fork(posterior: Posterior, scene: Scene, model: ForkedRoad) -> Figure:
         axes.plot(*known(scene)[name][:, :2].T, ls=(0, (5, 3)), lw=1.1, color=TRUTH, label=text, zorder=6)
     draw_spreads(axes, scene.data)
     _draw_followers(axes, scene.data, followers(drawn, scene.data, model))
-    axes.plot(0.0, 0.0, marker="o", ms=9, mfc="white", mec=INK, mew=1.6, ls="none", label="the car", zorder=7)
+    axes.plot(0.0, 0.0, marker="o", ms=9, mfc="white", mec=INK, mew=1.6, ls="none", label="own car", zorder=7)
     axes.set(xlabel="x, ahead of the car [m]", ylabel="y, to the left [m]")
     axes.set_ylim(min(axes.get_ylim()[0], -15.0), max(axes.get_ylim()[1], 15.0))
     axes.grid(color=FAINT, lw=0.4)
@@ -80,6 +80,8 @@ def followers(drawn: DrawnFork, cues: Cues, model: ForkedRoad) -> Floats:
 
 def _draw_followers(axes: Axes, cues: Cues, second: Floats) -> None:
     """Cues by kind, coloured by course."""
+    for colour, text in ((ESTIMATE, "follows the main course"), (SECOND, "follows the second"), (EITHER, "either")):
+        axes.plot([], [], marker="o", color=colour, ms=5.5, mew=0, ls="none", label=text)
     for kind in dict.fromkeys(cues.kind.tolist()):
         marker, _ = LOOKS.get(kind, OTHER)
         axes.plot([], [], marker=marker, color=EITHER, ms=5.5, mew=0, ls="none", label=kind)

@@ -87,7 +87,7 @@ def _draw_above(axes: Axes, cues: Cues, guess: Floats, band: tuple[Floats, Float
     draw_band(axes, guess, band, ESTIMATE)
     _draw_estimate(axes, guess, reach)
     _draw_cues(axes, cues)
-    axes.plot(0.0, 0.0, marker="o", ms=9, mfc="white", mec=INK, mew=1.6, ls="none", label="the car", zorder=6)
+    axes.plot(0.0, 0.0, marker="o", ms=9, mfc="white", mec=INK, mew=1.6, ls="none", label="own car", zorder=6)
     lowest, highest = (f([f(guess[:, 1]), f(cues.position[:, 1])]) for f in (np.min, np.max))
     middle, half = 0.5 * (lowest + highest), max(0.5 * (highest - lowest) + 4.0, 15.0)
     axes.set(xlim=(-12.0, RANGES[-1] + 12.0), ylim=(middle - half, middle + half), ylabel="y, to the left [m]")
@@ -134,6 +134,7 @@ def draw_spreads(axes: Axes, cues: Cues) -> None:
     place = {"offsets": cues.position, "offset_transform": axes.transData}
     look = {"facecolors": "none", "edgecolors": "#9aa3ab", "linewidths": 0.6, "zorder": 2}
     axes.add_collection(EllipseCollection(wide, narrow, angle, units="xy", **place, **look))
+    axes.plot([], [], marker=r"$\bigcirc$", color="#9aa3ab", ms=8, mew=0, ls="none", label="measured within 1 sd")
 
 
 def _draw_across(axes: Axes, guess: Floats, band: tuple[Floats, Floats], reach: float) -> None:
@@ -141,7 +142,7 @@ def _draw_across(axes: Axes, guess: Floats, band: tuple[Floats, Floats], reach: 
     for name, style in (("mid", "-"), ("wide", "--")):
         width = half_width(name)
         near, growth = TUBES[name]
-        text = f"{name} tube, {near:g} + {growth:g} r"
+        text = f"{name} tube, {near:g} m + {growth:g} r"
         axes.plot(ahead, width, color="#9aa3ab", lw=0.9, ls=style, label=text)
         axes.plot(ahead, -width, color="#9aa3ab", lw=0.9, ls=style)
     axes.fill_between(ahead, *band, color=ESTIMATE, alpha=0.25, lw=0, label="90 % band")

@@ -50,13 +50,11 @@ PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER, REACH, 
 # CLUTTER a density or 0, REACH [m] from the start of the course, inf for no end of the sight
 CHANGES, SPREAD_THERE, PRECISION_THERE, CONSTANT_THERE = range(
     13, 17
-)  # of a vehicle that changes lanes, and how likely
+)  # how probably its vehicle changes lanes, and then
 WIDTH = 17
 SPREADS = [SPREAD, SPREAD_THERE]  # what fog adds to
-RESIDUALS, LOCAL = (
-    4,
-    7,
-)  # of a cue, at most; a residual and its slopes in along, across, heading, curvature, offset, arc
+RESIDUALS = 4  # of a cue, at most
+LOCAL = 7  # a residual and its slopes in along, across, heading, curvature, offset, arc length
 ROOT_HALF = math.sqrt(0.5)
 LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
 UNDERFLOW = -30.0  # past that erfc does

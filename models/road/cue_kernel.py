@@ -48,9 +48,8 @@ from models.intersection.wrap import wrap
 PX, PY, FLOW, SXX, SXY, SYY, SPREAD, PRECISION, TURN, CONSTANT, CLUTTER, REACH, BLUR = range(13)
 # SPREAD and BLUR (reach_std^2) are variances [m^2], PRECISION 1 / std [1/rad], CONSTANT a log density,
 # CLUTTER a density or 0, REACH [m] from the start of the course, inf for no end of the sight
-CHANGES, SPREAD_THERE, PRECISION_THERE, CONSTANT_THERE = range(
-    13, 17
-)  # how probably its vehicle changes lanes, and then
+CHANGES, SPREAD_THERE, PRECISION_THERE, CONSTANT_THERE = range(13, 17)
+# CHANGES is how probably its vehicle changes lanes, the others what it has then
 WIDTH = 17
 SPREADS = [SPREAD, SPREAD_THERE]  # what fog adds to
 RESIDUALS = 4  # of a cue, at most

@@ -37,8 +37,8 @@ if TYPE_CHECKING:  # torch and matplotlib take seconds to import: help and skipp
 Engine = Callable[..., "Posterior"]
 Metric = Callable[["Posterior", "Scene"], dict[str, float]]
 Draw = Callable[["Posterior", "Scene"], dict[str, "Figure"]]
-PARTS = {"scenario", "model", "engine"}
-SETTINGS = PARTS | {"seed", "runs", "force", "functionals", "metrics", "figures", "compare_figures"}
+LISTS = ("functionals", "metrics", "figures", "compare_figures")
+SETTINGS = {"scenario", "model", "engine", "seed", "runs", "force", *LISTS}
 REMARKED = 100  # draws that a model looks at for its remarks
 Functional = Callable[["Posterior"], dict[str, Any]]
 
@@ -213,7 +213,7 @@ def _check(settings: dict[str, Any]) -> None:
     for name, seed in (("seed", settings["seed"]), ("scenario.seed", settings["scenario"].get("seed"))):
         if isinstance(seed, int) and seed < 0:
             raise ConfigError(f"{name} is {seed}; choose 0 or more")
-    for name in ("functionals", "metrics", "figures", "compare_figures"):
+    for name in LISTS:
         value = settings[name]
         if not isinstance(value, list) or not all(isinstance(v, dict) and v.get("_partial_") for v in value):
             raise ConfigError(

@@ -124,6 +124,14 @@ def kernel_types() -> dict[str, Any]:
 
 
 @lru_cache
+def compiled(function: Any, kind: str) -> Any:
+    """A function of a kernel with its explicit signature (`kernel_types`), from the disk cache where possible."""
+    import numba
+
+    return numba.njit(kernel_types()[kind], cache=True, error_model="numpy")(function)
+
+
+@lru_cache
 def pointer(function: Any) -> Any:
     """A compiled numba function of one explicit signature as a plain function pointer.
 

@@ -7,7 +7,7 @@ evaluated before; `commit` decides which row to keep."""
 from __future__ import annotations
 
 import math
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numba as nb
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from models.capability import Kernel, Move, Proposal, kernel_types
+from models.capability import Kernel, Move, Proposal, compiled
 from models.intersection import density, moves
 from models.intersection.density import EXACT, HALF, LIKELIHOODS, POINT
 from models.intersection.evidence import JunctionEvidence, clutter_costs, scaled
@@ -255,12 +255,6 @@ def commit(cache):  # type: ignore[no-untyped-def]
     n = MAX_ARMS
     for a in range(n):
         cache[a], cache[2 * n + a] = cache[n + a], cache[3 * n + a]
-
-
-@lru_cache
-def compiled(function: Any, kind: str) -> Any:
-    """A function of a kernel with its explicit signature, from the disk cache where possible."""
-    return nb.njit(kernel_types()[kind], cache=True, error_model="numpy")(function)
 
 
 def compiled_evaluate(model: Junction) -> Any:

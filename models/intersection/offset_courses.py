@@ -25,10 +25,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.capability import Kernel, Move, Proposal
+from models.capability import Kernel, Move, Proposal, compiled
 from models.intersection import offset_kernel
 from models.intersection.course_evidence import course_evidence
-from models.intersection.kernel import compiled
 from models.intersection.offset_kernel import MOMENTS, NUM_UNIFORMS, STATION
 from models.intersection.routes import RoutedTracks
 from models.intersection.spline_courses import first_lines, tracks_by_lane

@@ -11,7 +11,8 @@
            cosine between flow and tangent, sigma = std of the kind / sqrt(confidence). The last and errorFlow are ours:
            the paper says "related to the specific confidences" and "anti-correlation".
     exact  departs from it so that it is a density: residuals across the road, corrected to second order for the foot
-           between two samples, with the measured covariance propagated, and a mixture with clutter.
+           between two samples, with the measured covariance propagated, an end of the sight, and mixtures with clutter
+           and with vehicles that change lanes.
 
 Both take the prior's full covariance; the paper leaves it open. See models.road.cue_kernel for the equations.
 """

@@ -15,10 +15,10 @@ not farther; across the course it is normal about its offset o,
     p        = (1 - clutter) N(lateral; 0, variance) N(turn; 0, flow) Phi(sight) + clutter / width / (2 pi)
 
 Phi(sight) is the mean of seen(l) over where the cue may stand, given where it was measured. Without it the last cues
-are taken where noise has put them, beyond the sight as often as not, and bends are underestimated there: by a third of
-a standard deviation at 140 m. Clutter is anything that does not follow the road: a false detection, a side street, a
-vehicle changing lanes. In a bend, noise along the road moves cues across it by the order of k Sigma: less than a tenth
-of a standard deviation, and no correction of that order that was tried made slopes at the truth less biased.
+are taken where noise has put them, beyond the sight as often as not, and bends are underestimated there. Clutter is
+anything that does not follow the road: a false detection, a side street. In a bend, noise along the road moves cues
+across it by the order of k Sigma, which is left out: no correction of that order that was tried made slopes at the
+truth less biased.
 
 A vehicle v that changes lanes (probability c, all its detections together) is farther aside and turned,
 

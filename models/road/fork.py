@@ -25,10 +25,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, ClassVar
 
-import numba as nb
 import numpy as np
 import pyro
 import pyro.distributions as dist
@@ -36,7 +35,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.capability import Kernel, Move, Proposal, kernel_types
+from models.capability import Kernel, Move, Proposal, compiled
 from models.clothoid import Clothoid, evaluate, hermite
 from models.program import InputError, Latents, quiet_doubles, terms, total
 from models.road import fork_kernel, fork_moves
@@ -199,9 +198,3 @@ def unpack(z: Floats) -> dict[str, NDArray[Any]]:
         "shared": z[..., SHARED],
         "bend": z[..., SECOND_BEND : SECOND_RATE + 1],
     }
-
-
-@lru_cache
-def compiled(function: Any, kind: str) -> Any:
-    """A function of the kernel with its explicit signature, from the disk cache where possible."""
-    return nb.njit(kernel_types()[kind], cache=True, error_model="numpy")(function)

@@ -6,16 +6,14 @@ as there."""
 
 from __future__ import annotations
 
-import functools
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import numba as nb
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from models.capability import kernel_types
+from models.capability import compiled
 from models.clothoid import hermite, sample
 from models.clothoid_kernel import COLUMNS
 from models.program import InputError
@@ -134,9 +132,3 @@ def best_start(model: SegmentedRoad, evidence: RoadEvidence) -> Floats:
             if out.sum() > height:
                 best, height = z, float(out.sum())
     return best
-
-
-@functools.lru_cache
-def compiled(function: Any, kind: str) -> Any:
-    """A function of a kernel with its explicit signature, from the disk cache where possible."""
-    return nb.njit(kernel_types()[kind], cache=True, error_model="numpy")(function)

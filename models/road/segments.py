@@ -31,7 +31,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
-from models.capability import Kernel, Move, Proposal
+from models.capability import Kernel, Move, Proposal, compiled
 from models.clothoid import Points
 from models.clothoid_kernel import BEND, COLUMNS, HEADING, X, Y
 from models.program import InputError, Latents
@@ -39,7 +39,7 @@ from models.road.along_road import cue_arrays, scatter
 from models.road.course import RoadCourse
 from models.road.cues import Cues
 from models.road.evidence import RoadEvidence
-from models.road.segment_data import best_start, bound_evidence, bound_nothing, compiled, log_counts
+from models.road.segment_data import best_start, bound_evidence, bound_nothing, log_counts
 from models.road.segment_kernel import SHAPE, commit, cue_densities, evaluate, pack, samples_of, unpack
 from models.road.segment_moves import NAMES, PROBABILITIES, propose
 

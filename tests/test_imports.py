@@ -13,7 +13,15 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ALLOWED = {
     "models": {"models"},
-    "inference": {"inference", "models.program", "models.whitening", "models.capability", "models.overwrite"},
+    "inference": {
+        "inference",
+        "models.program",
+        "models.whitening",
+        "models.capability",
+        "models.overwrite",
+        "models.formula",
+        "models.multi_object",
+    },
     "experiments": {"experiments", "inference", "models"},
     "benchmarks": {"benchmarks", "experiments", "inference", "models"},
 }

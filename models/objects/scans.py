@@ -30,3 +30,9 @@ class Scan(NamedTuple):
     noise: Floats | None = None
     score: Floats | None = None
     likeness: Floats | None = None
+
+
+class Recording(NamedTuple):
+    """What all sensors of a car reported, in the order in which it arrived: late scans come late."""
+
+    scans: tuple[Scan, ...]

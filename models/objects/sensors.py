@@ -45,6 +45,7 @@ class Sensor:
     clutter       false alarms a scan, expected
     births        whether what it measures may begin a track
     edge          how soft the borders of the view are: angle [rad] and range [m]
+    confusion     (C + 1, L) p(looks l | kind), and in the last row of false alarms; None where it tells no kinds apart
     """
 
     name: str
@@ -56,6 +57,7 @@ class Sensor:
     clutter: float = 1.0
     births: bool = True
     edge: tuple[float, float] = (0.02, 1.0)
+    confusion: tuple[tuple[float, ...], ...] | None = None
 
     names: ClassVar[tuple[str, ...]] = ()
 
@@ -103,13 +105,18 @@ class Sensor:
         raise NotImplementedError
 
     def clutter_intensity(self, values: Floats) -> Floats:
-        """lambda_c (M,): uniform in what is measured, over the view."""
-        return np.full(len(values), self.clutter / self.volume)
+        """lambda_c (*, M) of values (*, M, d): uniform over the span; the same beyond it, where noise may lead."""
+        return np.full(values.shape[:-1], self.clutter / self.volume)
+
+    @property
+    def span(self) -> Floats:
+        """(d, 2) lowest and highest false alarm."""
+        raise NotImplementedError
 
     @property
     def volume(self) -> float:
         """Of the measurements that are possible."""
-        raise NotImplementedError
+        return float(np.prod(self.span[:, 1] - self.span[:, 0]))
 
     def feature(self, scan: Scan, num_kinds: int) -> Floats:
         """(M, C) p(score, looks | kind) / p(score, looks | false alarm). A score s that is the probability to be no
@@ -164,8 +171,8 @@ class Position(Sensor):
         return Placed(values, noise)
 
     @property
-    def volume(self) -> float:
-        return (2 * self.extent) ** 2
+    def span(self) -> Floats:
+        return np.add(self.middle, self.extent * np.array([[-1.0, -1.0], [1.0, 1.0]])).T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,8 +194,8 @@ class RangeBearing(Sensor):
         return Placed(position, slope @ noise[:, :2, :2] @ slope.swapaxes(-1, -2))
 
     @property
-    def volume(self) -> float:
-        return (self.reach[1] - self.reach[0]) * self.angle
+    def span(self) -> Floats:
+        return np.array([self.reach, (-self.angle / 2, self.angle / 2)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,5 +213,5 @@ class Radar(RangeBearing):
         return (distance, bearing, (dx * body.vx + dy * body.vy) / distance)
 
     @property
-    def volume(self) -> float:
-        return super().volume * 2 * self.fastest
+    def span(self) -> Floats:
+        return np.vstack([super().span, (-self.fastest, self.fastest)])

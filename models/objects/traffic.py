@@ -24,9 +24,11 @@ from numpy.typing import NDArray
 from models.formula import Formula
 from models.multi_object import Bernoullis, Components, Moved, View, no_components, no_objects
 from models.objects.motion import ANGLES, ConstantTurn, Motion, Scalars, move_formula, noise_formula
-from models.objects.scans import Scan
+from models.objects.scans import Recording, Scan
+from models.objects.scene import ScanFrame, State, first, frames_of, in_order, see, step
 from models.objects.sensors import Sensor, mounted
 from models.program import InputError
+from models.unroll import unroll
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -76,6 +78,8 @@ class Traffic:
     kinds: tuple[Kind, ...] = (Kind(),)
     unseen_density: float = 1e-4  # [1/m^2]
     places: tuple[Place, ...] = ()
+    region: tuple[float, float, float, float] = (-100.0, -100.0, 100.0, 100.0)  # x, y to x, y [m]: of the program
+    slots: int = 6  # for objects of the program
 
     def __post_init__(self) -> None:
         names = [sensor.name for sensor in self.sensors]
@@ -121,6 +125,42 @@ class Traffic:
             )
         return self._sensors[scan.sensor]
 
+    @property
+    def unseen_numbers(self) -> Floats:
+        """(1, C) objects expected in the region, by kind."""
+        x0, y0, x1, y1 = self.region
+        return self.unseen_density * (x1 - x0) * (y1 - y0) * np.array([[kind.share for kind in self.kinds]])
+
+    @property
+    def arrival_rates(self) -> Floats:
+        """(O, C) newcomers [1/s], from anywhere in the region and from each place, by kind."""
+        share = np.array([kind.share for kind in self.kinds])
+        return np.vstack([self.unseen_numbers / self._lifetime, *(place.rate * share for place in self.places)])
+
+    def newcomer(self, kind: Kind) -> tuple[Floats, Floats]:
+        """Mean and standard deviation (n,) of a newcomer's state; not used of its position and heading."""
+        return _state_prior(self.motion, kind, 0.5)
+
+    def formulas(self, sensor: Sensor) -> tuple[Formula, Formula]:
+        """h and p_D of a sensor: see sensor_formulas."""
+        return sensor_formulas(self.motion, type(sensor), len(sensor.settings))  # type: ignore[arg-type]
+
+    def prepare(self, recording: Recording) -> tuple[ScanFrame, ...]:
+        """The frames of a recording, in its order."""
+        return frames_of(self, recording.scans)
+
+    def __call__(self, frames: Sequence[ScanFrame]) -> None:
+        unroll(self)(in_order(frames))
+
+    def initial(self, frame: ScanFrame) -> State:
+        return first(self, frame)
+
+    def transition(self, state: State, frame: ScanFrame) -> State:
+        return step(self, state, frame)
+
+    def observe(self, state: State, frame: ScanFrame) -> None:
+        see(self, state, frame)
+
     def move(self, kind: Ints, mean: Floats, seconds: float) -> Moved:
         size, num = len(self.names), len(kind)
         moved, slope = np.empty((num, size)), np.empty((num, size, size))
@@ -136,7 +176,7 @@ class Traffic:
         at = mounted(scan.pose, sensor.mount)
         states = np.concatenate([objects.components.mean, more.mean])
         num, size, d = len(states), len(self.names), len(sensor.names)
-        measure, detect = sensor_formulas(self.motion, type(sensor), len(sensor.settings))  # type: ignore[arg-type]
+        measure, detect = self.formulas(sensor)
         predicted, slope, detection = np.empty((num, d)), np.empty((num, d, size)), np.empty((num, 1))
         measure.compiled()(states, at[None], predicted, slope)
         detect.compiled(jacobian=False)(states, np.concatenate([at, sensor.settings])[None], detection)

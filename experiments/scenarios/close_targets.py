@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from experiments.scenarios.moving_objects import points, see, truth_of
 from experiments.scenarios.scene import Scene
 from models.objects.motion import ConstantVelocity
+from models.objects.scans import Recording
 from models.objects.sensors import Position
 from models.objects.traffic import Kind, Traffic
 from models.program import InputError
@@ -74,7 +75,7 @@ def close_targets(
     )
     info = {"scenario": "close_targets", "seed": seed, "pattern": pattern, "number": number, "spacing_m": spacing}
     info |= {"noise_m": noise, "duration_s": duration, "detection": detection, "clutter": clutter, "scans": len(scans)}
-    return Scene(scans, truth_of(world, model.motion), f"close_targets {pattern} {seed}", info)
+    return Scene(Recording(scans), truth_of(world, model.motion), f"close_targets {pattern} {seed}", info)
 
 
 def ways(time: Floats, pattern: str, number: int, spacing: float, rng: np.random.Generator) -> Floats:

@@ -14,6 +14,7 @@ import numpy as np
 from experiments.scenarios.moving_objects import points, see, truth_of
 from experiments.scenarios.scene import Scene
 from models.objects.motion import ConstantVelocity
+from models.objects.scans import Recording
 from models.objects.sensors import Position
 from models.objects.traffic import Kind, Traffic
 from models.program import InputError
@@ -36,9 +37,7 @@ TARGETS = (
 )
 
 
-def crossing_targets(
-    seed: int = 0, clutter: float = 30.0, detection: float = 0.98, noise: float = 10.0
-) -> Scene:
+def crossing_targets(seed: int = 0, clutter: float = 30.0, detection: float = 0.98, noise: float = 10.0) -> Scene:
     """The benchmark: what happens is the same for all seeds, what is seen is not.
 
     clutter    false alarms a scan; 30 and 66 are usual
@@ -55,12 +54,10 @@ def crossing_targets(
     model = Traffic((sensor,), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),))
     world = points(np.arange(float(SCANS)), _ways())
     seeds = np.random.SeedSequence(seed).spawn(SCANS)
-    scans = tuple(
-        see(model, "plots", world, t, np.zeros(3), np.random.default_rng(seeds[t]))[0] for t in range(SCANS)
-    )
+    scans = tuple(see(model, "plots", world, t, np.zeros(3), np.random.default_rng(seeds[t]))[0] for t in range(SCANS))
     info = {"scenario": "crossing_targets", "seed": seed, "clutter": clutter, "detection": detection}
     info |= {"noise_m": noise, "scans": SCANS, "measurements": sum(len(scan.values) for scan in scans)}
-    return Scene(scans, truth_of(world, model.motion), f"crossing_targets {seed}", info)
+    return Scene(Recording(scans), truth_of(world, model.motion), f"crossing_targets {seed}", info)
 
 
 def _ways() -> np.ndarray:

@@ -29,9 +29,7 @@ class Sweep(NamedTuple):
     distance: Floats
 
 
-def sweep(
-    laser: Laser, at: Floats, angle: float, reach: float, rectangles: Floats, rng: np.random.Generator
-) -> Sweep:
+def sweep(laser: Laser, at: Floats, angle: float, reach: float, rectangles: Floats, rng: np.random.Generator) -> Sweep:
     """Beams over an opening angle [rad], up to `reach` [m], from a sensor at (3,) x, y [m], heading [rad].
 
     rectangles (N, 5): x, y of the middle [m], heading [rad], length and width [m]."""
@@ -49,10 +47,12 @@ def ranges(at: Floats, direction: Floats, rectangles: Floats) -> Floats:
     turn = direction[:, None] - rectangles[:, 2]
     gap = np.asarray(at[:2]) - rectangles[:, :2]
     cos, sin = np.cos(rectangles[:, 2]), np.sin(rectangles[:, 2])
-    origin = np.stack([cos * gap[:, 0] + sin * gap[:, 1], cos * gap[:, 1] - sin * gap[:, 0]], -1)  # (N, 2)
-    ray = np.stack([np.cos(turn), np.sin(turn)], -1)  # (B, N, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = ((side * 0.5 * rectangles[:, 3:] - origin) / ray for side in (-1.0, 1.0))
-    enter, leave = np.fmin(first, second).max(-1), np.fmax(first, second).min(-1)
+    along, across = cos * gap[:, 0] + sin * gap[:, 1], cos * gap[:, 1] - sin * gap[:, 0]
+    pairs = list[tuple[Floats, Floats]]()
+    for ray, origin, size in ((np.cos(turn), along, rectangles[:, 3]), (np.sin(turn), across, rectangles[:, 4])):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first, second = (-0.5 * size - origin) / ray, (0.5 * size - origin) / ray  # (B, N)
+        pairs.append((np.fmin(first, second), np.fmax(first, second)))
+    enter, leave = np.maximum(pairs[0][0], pairs[1][0]), np.minimum(pairs[0][1], pairs[1][1])
     met = np.where((enter <= leave) & (leave > 0.0), np.maximum(enter, 0.0), np.inf)
     return np.asarray(met.min(1, initial=np.inf))

@@ -31,7 +31,7 @@ from experiments.scenarios.laser_beams import Laser, Sweep
 Floats = NDArray[np.float64]
 GAP = 0.8  # [m]
 FEWEST = 3  # points of a cluster, and of a side that tells how long it is
-HEADINGS = np.radians(np.arange(0.0, 90.0, 0.5))  # of one side
+HEADINGS = np.radians(np.arange(90.0))  # of one side
 # share; length and width with their standard deviations [m]: cars, bicycles, pedestrians
 SHAPES = ((0.6, 4.5, 0.4, 1.8, 0.15), (0.2, 1.8, 0.2, 0.6, 0.1), (0.2, 0.5, 0.1, 0.5, 0.1))
 

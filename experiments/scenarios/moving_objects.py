@@ -43,9 +43,7 @@ def points(time: Floats, state: Floats) -> World:
     return World(time, state, np.zeros(num, dtype=np.int64), np.full((num, 2), np.nan))
 
 
-def see(
-    model: Traffic, sensor: str, world: World, t: int, pose: Floats, rng: np.random.Generator
-) -> tuple[Scan, Ints]:
+def see(model: Traffic, sensor: str, world: World, t: int, pose: Floats, rng: np.random.Generator) -> tuple[Scan, Ints]:
     """A scan of those that are there at time t, by the model's sensor on a car at `pose`; and of each measurement the
     object that made it, -1 of a false alarm."""
     there = world.present(t)

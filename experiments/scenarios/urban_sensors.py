@@ -20,7 +20,7 @@ from experiments.scenarios.moving_objects import World, in_view, see, truth_of
 from experiments.scenarios.paths import wrap
 from experiments.scenarios.scene import Scene
 from models.objects.motion import ConstantTurn
-from models.objects.scans import Scan
+from models.objects.scans import Recording, Scan
 from models.objects.sensors import Radar, RangeBearing, Sensor
 from models.objects.traffic import Kind, Traffic
 from models.program import InputError
@@ -109,12 +109,13 @@ def urban_sensors(
     Raises InputError for numbers out of range and names that are not known."""
     _check(seed, number, duration, kinds, sensors, dropout, dropout_from, dropout_to, latency)
     way_seed, *scan_seeds = np.random.SeedSequence(seed).spawn(1 + len(SUITE))
-    clocks = {s.name: _ticks(s.name, duration) for s in SUITE if s.name in sensors}
+    clocks = {s.name: ticks_of(s.name, duration) for s in SUITE if s.name in sensors}
     ticks = np.unique(np.concatenate(list(clocks.values())))
     world = road_users(ticks, number, kinds, np.random.default_rng(way_seed))
-    suite = tuple(s for s in SUITE if s.name in sensors)
-    weather = tuple(replace(s, detection=BAD_WEATHER * s.detection) if s.name == "camera" else s for s in suite)
-    model = Traffic(weather if bad_weather else suite, ConstantTurn(), tuple(Kind(name=kind) for kind in kinds))
+    own = suite(kinds, sensors)
+    left = {"camera": BAD_WEATHER} if bad_weather else {}
+    there = tuple(replace(s, detection=left.get(s.name, 1.0) * s.detection) for s in own)
+    model = Traffic(there, ConstantTurn(), tuple(Kind(name=kind) for kind in kinds))
     pose, scans, arrival = np.zeros(3), list[Scan](), list[float]()
     for sensor, own_seed in zip(SUITE, scan_seeds, strict=True):
         rng = np.random.default_rng(own_seed)
@@ -123,21 +124,18 @@ def urban_sensors(
             if sensor.name == "laser" and raw_laser:
                 scan = beams(sensor, world, t, rng)
             else:
-                scan, source = see(model, sensor.name, world, t, pose, rng)
-                if sensor.name == "camera" and len(kinds) > 1:
-                    scan = scan._replace(likeness=looks(world.kind, source, len(kinds), rng))
+                scan, _ = see(model, sensor.name, world, t, pose, rng)
             if sensor.name != dropout or not dropout_from <= when < dropout_to:
                 scans.append(scan)
                 arrival.append(when + latency * (sensor.name == "camera"))
     order = np.lexsort((np.array([scan.time for scan in scans]), arrival))
-    told = in_view(suite, model.motion, world, np.zeros((len(ticks), 3)))
+    told = in_view(own, model.motion, world, np.zeros((len(ticks), 3)))
     info = {"scenario": "urban_sensors", "seed": seed, "number": number, "duration_s": duration}
     info |= {"kinds": ", ".join(kinds), "sensors": ", ".join(sensors), "dropout": dropout or "none"}
     info |= {"bad_weather": bad_weather, "latency_s": latency, "raw_laser": raw_laser, "scans": len(scans)}
     info |= {f"{kind}s": int((world.kind == k).sum()) for k, kind in enumerate(kinds)}
-    return Scene(
-        tuple(scans[i] for i in order), truth_of(world, model.motion, told), f"urban_sensors {seed}", info
-    )
+    data = Recording(tuple(scans[i] for i in order))
+    return Scene(data, truth_of(world, model.motion, told), f"urban_sensors {seed}", info)
 
 
 def _check(
@@ -158,7 +156,9 @@ def _check(
         )
     for what, names, known in (("kinds", kinds, HABITS), ("sensors", sensors, CLOCK)):
         if not names or len(set(names)) < len(names) or not set(names) <= set(known):
-            raise InputError(f"scenario urban_sensors: {what} are {list(names)}; choose some of {list(known)}, each once")
+            raise InputError(
+                f"scenario urban_sensors: {what} are {list(names)}; choose some of {list(known)}, each once"
+            )
     if dropout is not None and (dropout not in sensors or not dropout_from < dropout_to):
         raise InputError(
             f"scenario urban_sensors: {dropout} drops out from {dropout_from} to {dropout_to} s; "
@@ -168,7 +168,7 @@ def _check(
         raise InputError(f"scenario urban_sensors: latency is {latency} s; give 0 or more")
 
 
-def _ticks(sensor: str, duration: float) -> Ints:
+def ticks_of(sensor: str, duration: float) -> Ints:
     """When it scans, in steps of the clock."""
     first, period = (round(value / STEP) for value in CLOCK[sensor])
     return np.arange(first, round(duration / STEP) + 1, period)
@@ -202,15 +202,13 @@ def road_users(ticks: Ints, number: int, kinds: tuple[str, ...], rng: np.random.
     return World(STEP * ticks, told, kind.astype(np.int64), size)
 
 
-def looks(kind: Ints, source: Ints, num_kinds: int, rng: np.random.Generator) -> Floats:
-    """(M, C) p(label | kind) / p(label | false alarm), of the label that the camera gives each measurement: the right
-    one but for `CONFUSED`, any of a false alarm."""
-    confusion = np.full((num_kinds, num_kinds), CONFUSED)
-    np.fill_diagonal(confusion, 1.0 - CONFUSED * (num_kinds - 1))
-    of = np.concatenate([confusion, np.full((1, num_kinds), 1.0 / num_kinds)])
-    row = np.where(source >= 0, kind[source], num_kinds)
-    label = (np.cumsum(of, 1)[row, :-1] < rng.random(len(source))[:, None]).sum(1)
-    return confusion[:, label].T * num_kinds
+def suite(kinds: tuple[str, ...], sensors: tuple[str, ...]) -> tuple[Sensor, ...]:
+    """The sensors of these names; the camera takes a road user for each other kind with probability `CONFUSED`, and a
+    false alarm for any."""
+    num = len(kinds)
+    right = (1.0 - CONFUSED * num) * np.eye(num) + CONFUSED
+    table = tuple(tuple(row) for row in [*right.tolist(), [1.0 / num] * num]) if num > 1 else None
+    return tuple(replace(s, confusion=table) if s.name == "camera" else s for s in SUITE if s.name in sensors)
 
 
 def beams(sensor: Sensor, world: World, t: int, rng: np.random.Generator) -> Scan:

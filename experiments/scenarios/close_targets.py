@@ -1,6 +1,6 @@
 """Vehicles so close that noise alone confuses them: where a filter for each, fed with nearest neighbours, swaps them.
 
-[K15] gives this as the reason for its multi-object filter. All drive the same way at the same speed, but that each sways
+[K15] gives this as the reason for its multi-object filter. All drive the same way at the same speed, but each sways
 along and across by an Ornstein-Uhlenbeck velocity of its own, which no filter assumes:
 
     abreast   side by side

@@ -42,8 +42,8 @@ def sweep(laser: Laser, at: Floats, angle: float, reach: float, rectangles: Floa
 def ranges(at: Floats, direction: Floats, rectangles: Floats) -> Floats:
     """(B,) distance [m] from a point to the first rectangle in each direction [rad], inf where there is none.
 
-    In the frame of a rectangle the beam o + t d is between two sides for t within (+-h - o) / d; it enters the rectangle
-    where it has come between the second pair of sides, if it has not left the first by then."""
+    In the frame of a rectangle the beam o + t d is between two sides for t within (+-h - o) / d; it enters where it has
+    come between the second pair of sides, if it has not left the first by then."""
     turn = direction[:, None] - rectangles[:, 2]
     gap = np.asarray(at[:2]) - rectangles[:, :2]
     cos, sin = np.cos(rectangles[:, 2]), np.sin(rectangles[:, 2])

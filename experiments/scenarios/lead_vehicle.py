@@ -1,7 +1,8 @@
 """A winding rural road: a car ahead, 30 to 100 m away, oncoming traffic, and a car that knows its own pose roughly.
 
-[K15], section V-A, measures the distance to the leading vehicle with a reference system. Here road, speeds and distances
-are ours: the road is a sine of 20 m and 500 m, the distance another in time, and all vehicles follow their lane exactly.
+[K15], section V-A, measures the distance to the leading vehicle with a reference system. Here road, speeds and
+distances are ours: the road is a sine of 20 m and 500 m, the distance another in time, and all vehicles follow their
+lanes exactly.
 """
 
 from __future__ import annotations
@@ -86,25 +87,25 @@ def _worse(sensor: Sensor) -> Sensor:
 
 def drive(time: Floats, oncoming: bool, rng: np.random.Generator) -> tuple[Floats, World]:
     """Poses (T, 3) of the car, and the others, the one ahead first."""
-    gaps = np.cumsum(rng.uniform(*GAPS, math.ceil((time[-1] * (SPEED + ONCOMING[1]) + 300.0) / GAPS[0])))
-    met = gaps[gaps < time[-1] * (SPEED + ONCOMING[1]) + 300.0] if oncoming else np.zeros(0)
-    pace = rng.uniform(*ONCOMING, len(met))
-    end = SPEED * time[-1] + DISTANCE + SWING + 2 * GAPS[1]
-    ahead = DISTANCE + SWING * np.sin(time / PERIOD)
-    arc = np.concatenate([(SPEED * time + ahead)[:, None], met - pace * time[:, None]], 1)
-    speed = np.concatenate(
-        [(SPEED + SWING / PERIOD * np.cos(time / PERIOD))[:, None], np.tile(pace, (len(time), 1))], 1
-    )
-    push = np.concatenate([(-SWING / PERIOD**2 * np.sin(time / PERIOD))[:, None], np.zeros((len(time), len(met)))], 1)
-    course = road(min(0.0, float(arc.min())) - 1.0, max(end, float(arc.max())) + 1.0)
-    state = np.stack([lane(course, arc[:, i], speed[:, i], push[:, i], i > 0) for i in range(arc.shape[1])], 1)
+    reach = time[-1] * (SPEED + ONCOMING[1]) + 300.0
+    met = np.cumsum(rng.uniform(*GAPS, math.ceil(reach / GAPS[0])))
+    met = met[met < reach] if oncoming else np.zeros(0)
+    pace = np.append(0.0, rng.uniform(*ONCOMING, len(met)))
+    first = np.arange(len(pace)) == LEAD
+    arc = np.append(DISTANCE, met) - pace * time[:, None]
+    arc[:, LEAD] += SPEED * time + SWING * np.sin(time / PERIOD)
+    speed = pace + first * (SPEED + SWING / PERIOD * np.cos(time / PERIOD))[:, None]
+    push = first * (-SWING / PERIOD**2 * np.sin(time / PERIOD))[:, None]
+    course = road(min(0.0, float(arc.min())) - 1.0, float(arc.max()) + 1.0)
+    state = np.stack([lane(course, arc[:, i], speed[:, i], push[:, i], i != LEAD) for i in range(arc.shape[1])], 1)
     me = lane(course, SPEED * time, np.full_like(time, SPEED), np.zeros_like(time), False)
     num = state.shape[1]
     return me[:, :3], World(time, state, np.zeros(num, dtype=np.int64), np.tile(CAR, (num, 1)))
 
 
 def road(begin: float, end: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Arc length from x = 0, x, y, heading and curvature of the middle of the car's lane, at least from begin to end."""
+    """Arc length from x = 0, x, y, heading and curvature of the middle of the car's lane, from begin to end at
+    least."""
     x = np.arange(min(begin, 0.0), end, 0.05)
     slope = HEIGHT / LENGTH * np.cos(x / LENGTH)
     bend = -HEIGHT / LENGTH**2 * np.sin(x / LENGTH)

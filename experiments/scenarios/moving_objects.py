@@ -62,7 +62,7 @@ def in_view(sensors: tuple[Sensor, ...], motion: Motion, world: World, pose: Flo
     for t, own in enumerate(pose):
         body = motion.body(tuple(world.state[t].T), np)
         for sensor in sensors:
-            reached = sensor.detect(body, mounted(own, sensor.mount), sensor.settings, np)
+            reached = sensor.detect(body, tuple(mounted(own, sensor.mount)), sensor.settings, np)
             inside[t] |= reached > 0.5 * sensor.detection
     return inside
 

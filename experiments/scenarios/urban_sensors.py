@@ -1,8 +1,8 @@
 """Cars, bicycles and pedestrians around a car that waits in a city, seen by a radar, a laser and a camera.
 
 Each sensor has a clock of its own. The road users are no draws of the model: they steer and accelerate by
-Ornstein-Uhlenbeck processes, drift back to the speed of their kind, and turn round where they would leave the place, with
-other noise than any filter assumes. Nothing hides them from each other, but from a laser of which beams are simulated.
+Ornstein-Uhlenbeck processes, drift back to the speed of their kind, and turn round where they would leave the place,
+with other noise than any filter assumes. Nothing hides one behind another, unless the laser's beams are simulated.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def urban_sensors(
             if sensor.name != dropout or not dropout_from <= when < dropout_to:
                 scans.append(scan)
                 arrival.append(when + latency * (sensor.name == "camera"))
-    order = np.lexsort((np.array([scan.time for scan in scans]), arrival))
+    order = np.lexsort(np.array([[scan.time for scan in scans], arrival]))
     told = in_view(own, model.motion, world, np.zeros((len(ticks), 3)))
     info = {"scenario": "urban_sensors", "seed": seed, "number": number, "duration_s": duration}
     info |= {"kinds": ", ".join(kinds), "sensors": ", ".join(sensors), "dropout": dropout or "none"}
@@ -199,7 +199,7 @@ def road_users(ticks: Ints, number: int, kinds: tuple[str, ...], rng: np.random.
         pace = (ahead - speed) / STEP  # none where the limit holds it
         middle, way = heading + 0.5 * STEP * rate, 0.5 * STEP * (speed + ahead)
         x, y, heading, speed = x + way * np.cos(middle), y + way * np.sin(middle), heading + STEP * rate, ahead
-    return World(STEP * ticks, told, kind.astype(np.int64), size)
+    return World(np.asarray(STEP * ticks, dtype=np.float64), told, kind.astype(np.int64), size)
 
 
 def suite(kinds: tuple[str, ...], sensors: tuple[str, ...]) -> tuple[Sensor, ...]:

@@ -29,9 +29,10 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from models.objects.motion import move_formula, noise_formula
+from models.objects.perception import together
 from models.objects.scan_set import FalseAlarms, Looks, ScanSet, wrapped
 from models.objects.scans import Scan
-from models.objects.sensors import mounted
+from models.objects.sensors import Sensor, hidden_formula, mounted, spread_formula
 from models.program import InputError, quiet_doubles
 
 if TYPE_CHECKING:
@@ -65,13 +66,9 @@ class ScanFrame(NamedTuple):
 
 
 def frames_of(model: Traffic, scans: Sequence[Scan]) -> tuple[ScanFrame, ...]:
-    """The frames of scans, in their order. Scans whose values are None await simulation."""
-    frames, before = list[ScanFrame](), None
-    for scan in scans:
-        values = None if scan.values is None else rows_of(model, scan)
-        frames.append(ScanFrame(values, scan, 0.0 if before is None else scan.time - before))
-        before = scan.time
-    return tuple(frames)
+    """The frames of scans, in their order."""
+    gaps = np.diff([scan.time for scan in scans], prepend=[scan.time for scan in scans[:1]]).tolist()
+    return tuple(ScanFrame(rows_of(model, scan), scan, gap) for scan, gap in zip(scans, gaps, strict=True))
 
 
 def in_order(frames: Sequence[ScanFrame]) -> tuple[ScanFrame, ...]:
@@ -98,16 +95,20 @@ def scan_set(
     at = torch.from_numpy(mounted(scan.pose, sensor.mount))
     measure, detect = model.formulas(sensor)
     predicted = measure.torch(state, at)
-    detection = detect.torch(state, torch.cat([at, torch.tensor(sensor.settings)]))[..., 0] * exists
-    noise = sensor.covariance(scan)
+    settings = torch.cat([at, torch.tensor(sensor.settings)]).expand(*exists.shape, -1)
+    hidden = _hidden(model, sensor, at, kind, state, exists)
+    detection = detect.torch(state, torch.cat([settings, hidden[..., None]], -1))[..., 0] * exists
+    if scan.noise is None:
+        spread = spread_formula(type(sensor), len(sensor.noise_settings))  # type: ignore[arg-type]
+        noise = torch.diag_embed(spread.torch(predicted, torch.tensor(sensor.noise_settings)).square())
+    else:
+        noise = torch.from_numpy(scan.noise)
     low, high = (torch.from_numpy(v.copy()) for v in sensor.span.T)
-    looks = None
-    if sensor.confusion is not None:
-        table = torch.tensor(sensor.confusion)
-        looks = Looks(table[:-1], table[-1])
+    table = None if sensor.confusion is None else torch.tensor(sensor.confusion)
+    looks = None if table is None else Looks(table[:-1], table[-1])
     return ScanSet(
         predicted,
-        torch.from_numpy(noise),
+        noise,
         detection,
         kind,
         FalseAlarms(sensor.clutter, low, high),
@@ -117,6 +118,19 @@ def scan_set(
         looks,
         rows,
     )
+
+
+def _hidden(model: Traffic, sensor: Sensor, at: Tensor, kind: Tensor, state: Tensor, exists: Tensor) -> Tensor:
+    """(*B, S) mass of being hidden behind others that exist."""
+    if sensor.occlusion == 0.0:
+        return torch.zeros_like(exists)
+    num, place = exists.shape[-1], state[..., :2]
+    pairs = (*state.shape[:-2], num, num)
+    radius = torch.tensor([k.radius for k in model.kinds])[kind].expand(pairs[:-1])
+    x = torch.cat([place[..., :, None, :].expand(*pairs, 2), place[..., None, :, :].expand(*pairs, 2)], -1)
+    radii = torch.stack([radius[..., :, None].expand(pairs), radius[..., None, :].expand(pairs)], -1)
+    share = hidden_formula().torch(x, torch.cat([at.expand(*pairs, 3), radii], -1))[..., 0]
+    return sensor.occlusion * torch.as_tensor(together(share * (1.0 - torch.eye(num)), exists))
 
 
 def simulate_scan(

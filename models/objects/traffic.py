@@ -121,6 +121,17 @@ class Traffic:
             )
         return self._sensors[scan.sensor]
 
+    def check(self, scan: Scan) -> None:
+        """Raise InputError for a scan that cannot be used."""
+        sensor, values = self.sensor(scan), np.asarray(scan.values)
+        if values.ndim != 2 or values.shape[1] != len(sensor.names) or not np.isfinite(values).all():
+            raise InputError(
+                f"the scan of sensor '{scan.sensor}' at {scan.time} s has values of shape {values.shape}, finite: "
+                f"{bool(np.isfinite(values).all())}; give finite numbers (M, {len(sensor.names)}): {sensor.names}"
+            )
+        if not math.isfinite(scan.time) or not np.isfinite(scan.pose).all():
+            raise InputError(f"a scan of sensor '{scan.sensor}' has time {scan.time} and pose {scan.pose}; give numbers")
+
     def move(self, kind: Ints, mean: Floats, seconds: float) -> Moved:
         size, num = len(self.names), len(kind)
         moved, slope = np.empty((num, size)), np.empty((num, size, size))

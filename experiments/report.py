@@ -45,7 +45,7 @@ def write_report(
     folder: Path,
     title: str,
     result: Result,
-    tables: dict[str, list[dict[str, float]]],
+    tables: dict[str, list[dict[str, Any]]],
     images: dict[str, str],
     failures: dict[str, Exception],
     manifest: dict[str, Any],
@@ -82,10 +82,13 @@ def write_report(
 
 
 def save_figures(folder: Path, figures: dict[str, Any]) -> tuple[dict[str, str], dict[str, Exception]]:
-    """Write figures/*.png; {name: <img> with the picture inside}, and what matplotlib could not draw."""
+    """Write figures/*.png; {name: <img> with the picture inside}, and what matplotlib could not draw.
+
+    What is drawn otherwise than as PNG has a `suffix`, such as .gif, and its own savefig(file, dpi=)."""
     images, failures = {}, {}
     for name, figure in figures.items():
-        file = folder / "figures" / f"{name}.png"
+        suffix = getattr(figure, "suffix", ".png")
+        file = folder / "figures" / f"{name}{suffix}"
         file.parent.mkdir(exist_ok=True)
         try:
             figure.savefig(file, dpi=130)
@@ -94,7 +97,7 @@ def save_figures(folder: Path, figures: dict[str, Any]) -> tuple[dict[str, str],
             failures[f"figure {name}"] = error
             continue
         data = base64.b64encode(file.read_bytes()).decode()
-        images[name] = f'<img alt="{escape(name)}" src="data:image/png;base64,{data}">'
+        images[name] = f'<img alt="{escape(name)}" src="data:image/{suffix[1:]};base64,{data}">'
     return images, failures
 
 

@@ -258,6 +258,7 @@ def write(job: Job, result: Result, warm: bool = False) -> dict[str, Exception]:
     from experiments.lane_posterior import LanePosterior
     from experiments.report import save_figures, write_report
     from inference.diagnostics import summary
+    from inference.tracks import Tracks
 
     seeds = {"run": job.config["seed"], "engine": engine_seed(job.config["seed"])}
     with store.writing(job.folder) as folder:
@@ -274,7 +275,10 @@ def write(job: Job, result: Result, warm: bool = False) -> dict[str, Exception]:
             lanes = result.posterior.table() if isinstance(result.posterior, LanePosterior) else []
             if isinstance(result.posterior, LanePosterior) and result.posterior.courses is not None:
                 store.write_json(folder / "courses.json", summary(result.posterior.courses))
-            tables = {"Arms found": found, "Lanes found": lanes}
+            tracks = result.posterior.table() if isinstance(result.posterior, Tracks) else []
+            if tracks:
+                store.write_rows(folder / "tracks.csv", tracks)
+            tables = {"Arms found": found, "Lanes found": lanes, "Tracks found": tracks}
             write_report(folder, job.name, result, tables, images, failures, manifest)
         except Exception as error:
             failures["report"] = error

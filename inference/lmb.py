@@ -22,6 +22,7 @@ Existence below `faint` is left out, and what was lost so is told: nothing vanis
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ import numpy as np
 from inference.lmb_kernel import heaviest, propagate, update
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
-from models.multi_object import Bernoullis, Components, HasObjects, Timed
+from models.multi_object import Bernoullis, Components, HasObjects, Timed, no_objects
 
 STRIDE = 1 << 20  # labels: number of the scan times this, plus the measurement
 LONGEST = 0.5  # a longer time is gone in several steps: motion is linearised at each [s]
@@ -108,7 +109,6 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
         raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
     posterior = Bernoullis(label, existence, Components(*parts))
     return Belief(scan.time, posterior), Facts(log_factor, int(loopy), float(left_out))
-
 
 
 def tell(belief: Belief, report: float, num_kinds: int) -> Objects:

@@ -234,8 +234,8 @@ def update(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """The posterior of T objects given a scan, with those that it shows first; equations in inference.lmb.
 
-    Returns (source, existence, offset, weight, kind, mean, P, facts): source (T',) is the old object, or -1 - j for one that
-    measurement j shows first; facts = (log partition, groups solved by belief propagation, existence left out)."""
+    Returns (source, existence, offset, weight, kind, mean, P, facts): source (T',) is the old object, or -1 - j for one
+    that measurement j shows first; facts = (log partition, groups by belief propagation, existence left out)."""
     num, count, n, d, M = len(existence), len(weight), mean.shape[1], slope.shape[1], len(values)
     mass, rho = unseen_mass(
         new_offset,

@@ -1,7 +1,7 @@
 """Filters of many objects over the scans of many sensors, each in its time: what all of them share.
 
-A filter is a step from one belief to the next. Scans come in the order of their arrival, which need not be that of their
-times: one that comes late, but not by more than `patience` seconds, is put where it belongs, and the steps of the scans
+A filter is a step from one belief to the next. Scans come in the order of their arrival, which need not be that of
+their times: one that comes late, but not by more than `patience` seconds, is put where it belongs, and the steps of the scans
 after it are done again from the belief of then. So the belief is what it would have been had all come in time. A scan
 that comes later still is left out, and told of.
 """
@@ -110,7 +110,12 @@ def track(
 
 
 def _tracks(
-    model: HasObjects, scans: Sequence[Any], now: list[float], told: list[Objects], info: dict[str, Any], log_factor: float
+    model: HasObjects,
+    scans: Sequence[Any],
+    now: list[float],
+    told: list[Objects],
+    info: dict[str, Any],
+    log_sum: float,
 ) -> Tracks:
     """All that was told, labels counted from 0 in the order of their first appearance."""
     size = [len(objects.label) for objects in told]
@@ -129,6 +134,6 @@ def _tracks(
         names=model.names,
         kind_names=model.kind_names,
         sensor=tuple(scan.sensor for scan in scans),
-        log_evidence=log_factor,
+        log_evidence=log_sum,
         info=info,
     )

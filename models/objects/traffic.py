@@ -130,7 +130,9 @@ class Traffic:
                 f"{bool(np.isfinite(values).all())}; give finite numbers (M, {len(sensor.names)}): {sensor.names}"
             )
         if not math.isfinite(scan.time) or not np.isfinite(scan.pose).all():
-            raise InputError(f"a scan of sensor '{scan.sensor}' has time {scan.time} and pose {scan.pose}; give numbers")
+            raise InputError(
+                f"a scan of sensor '{scan.sensor}' has time {scan.time} and pose {scan.pose}; give numbers"
+            )
 
     def move(self, kind: Ints, mean: Floats, seconds: float) -> Moved:
         size, num = len(self.names), len(kind)

@@ -4,8 +4,9 @@
         manifest.json  scores.json  diagnostics.json  posterior.npz  posterior.json
         arms.csv       where the estimate is a junction
         lanes.csv  lanes.npz  lanes.osm   where it has lanes
+        tracks.csv     where objects are tracked
         courses.json   diagnostics of the numbers of their courses
-        figures/*.png  report.html
+        figures/*.png, *.gif  report.html
 
 The identity is a hash of the resolved config, of the source code and of the input files: a run that
 is done under the same identity need not run again.

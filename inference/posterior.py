@@ -41,6 +41,7 @@ class Posterior:
     estimate      {site: (*event)} the best single state (highest log joint seen)
     info          evaluations, seconds, acceptance by move, flags: plain numbers, strings, lists
     snapshots     along the iterations, None where the engine keeps none
+    labels        {site: what people call each of its numbers, with the unit}, where the model says so
     """
 
     draws: dict[str, Array]
@@ -50,12 +51,19 @@ class Posterior:
     estimate: dict[str, Array] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
     snapshots: Snapshots | None = None
+    labels: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def shape(self) -> tuple[int, int]:
         """(chains, draws)."""
         first = next(iter(self.draws.values()))
         return first.shape[0], first.shape[1]
+
+    def label(self, site: str, index: tuple[int, ...] = ()) -> str:
+        """What people call a number of a site; 'site[i]' where nobody says."""
+        if site not in self.labels:
+            return site + (str(list(index)) if index else "")
+        return self.labels[site][int(np.ravel_multi_index(index, self.draws[site].shape[2:])) if index else 0]
 
     @property
     def weights(self) -> Array:
@@ -75,7 +83,8 @@ class Posterior:
     def sd(self, site: str) -> Array:
         """Posterior standard deviation of a site, (*event)."""
         values = self.draws[site]
-        return np.sqrt((np.square(values - self.mean(site)) * self._weights_like(values)).sum((0, 1)))
+        mean = Posterior.mean(self, site)  # Tracks call the means of their states so
+        return np.sqrt((np.square(values - mean) * self._weights_like(values)).sum((0, 1)))
 
     def quantile(self, site: str, q: float) -> Array:
         """Weighted quantile of a site, (*event)."""
@@ -124,6 +133,12 @@ class Posterior:
 
     def save(self, folder: Path) -> None:
         """Write posterior.npz (arrays) and posterior.json (the rest) into a folder."""
+        arrays, rest = self._contents()
+        np.savez_compressed(folder / "posterior.npz", allow_pickle=False, **arrays)
+        (folder / "posterior.json").write_text(json.dumps(rest, indent=2, default=_plain))
+
+    def _contents(self) -> tuple[dict[str, Array], dict[str, Any]]:
+        """The arrays by their names in posterior.npz, and what goes into posterior.json."""
         arrays: dict[str, Array] = {f"draws/{k}": v for k, v in self.draws.items()}
         arrays |= {f"estimate/{k}": v for k, v in self.estimate.items()}
         if self.log_weights is not None:
@@ -134,30 +149,42 @@ class Posterior:
             s = self.snapshots
             arrays |= {"snapshots.step": s.step, "snapshots.seconds": s.seconds, "snapshots.log_joint": s.log_joint}
             arrays |= {f"snapshots/{k}": v for k, v in s.states.items()}
-        np.savez_compressed(folder / "posterior.npz", allow_pickle=False, **arrays)
-        rest = {"log_evidence": self.log_evidence, "info": self.info}
-        (folder / "posterior.json").write_text(json.dumps(rest, indent=2, default=_plain))
+        return arrays, {"log_evidence": self.log_evidence, "info": self.info, "labels": self.labels}
 
     @staticmethod
     def load(folder: Path) -> Posterior:
         """Read what `save` wrote; no pickle is ever opened."""
-        rest = json.loads((folder / "posterior.json").read_text())
-        with np.load(folder / "posterior.npz", allow_pickle=False) as file:
-            arrays = dict(file)
-        part = lambda head: {k[len(head) :]: v for k, v in arrays.items() if k.startswith(head)}  # noqa: E731
-        snapshots = None
-        if "snapshots.step" in arrays:
-            step, seconds, log_joint = (arrays[f"snapshots.{name}"] for name in ("step", "seconds", "log_joint"))
-            snapshots = Snapshots(step, seconds, log_joint, part("snapshots/"))
-        return Posterior(
-            part("draws/"),
-            arrays.get("log_weights"),
-            rest["log_evidence"],
-            arrays.get("model_index"),
-            part("estimate/"),
-            rest["info"],
-            snapshots,
-        )
+        return Posterior(**fields_of(*stored(folder)))
+
+
+def stored(folder: Path) -> tuple[dict[str, Array], dict[str, Any]]:
+    """The arrays of posterior.npz and the content of posterior.json; no pickle is ever opened."""
+    rest = json.loads((folder / "posterior.json").read_text())
+    with np.load(folder / "posterior.npz", allow_pickle=False) as file:
+        return dict(file), rest
+
+
+def fields_of(arrays: dict[str, Array], rest: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a Posterior out of what was stored."""
+    snapshots = None
+    if "snapshots.step" in arrays:
+        step, seconds, log_joint = (arrays[f"snapshots.{name}"] for name in ("step", "seconds", "log_joint"))
+        snapshots = Snapshots(step, seconds, log_joint, part_of(arrays, "snapshots/"))
+    return {
+        "draws": part_of(arrays, "draws/"),
+        "log_weights": arrays.get("log_weights"),
+        "log_evidence": rest["log_evidence"],
+        "model_index": arrays.get("model_index"),
+        "estimate": part_of(arrays, "estimate/"),
+        "info": rest["info"],
+        "snapshots": snapshots,
+        "labels": {site: tuple(names) for site, names in rest.get("labels", {}).items()},
+    }
+
+
+def part_of(arrays: dict[str, Array], head: str) -> dict[str, Array]:
+    """The arrays whose names begin so, without that beginning."""
+    return {name.removeprefix(head): values for name, values in arrays.items() if name.startswith(head)}
 
 
 def _plain(value: Any) -> Any:

@@ -60,6 +60,37 @@ class JunctionTruth(NamedTuple):
     driven: NDArray[np.bool_] | None = None
 
 
+class TrafficTruth(NamedTuple):
+    """Who was where, at each of T times; R rows in all, those of time t being offset[t] ... offset[t + 1] - 1.
+
+    time           (T,) never decreasing [s]; times of scans that see the traffic must be among them
+    offset         (T + 1,)
+    label          (R,) who it is, the same over time
+    x, y           (R,) middle of the object in the world [m]
+    vx, vy         (R,) [m/s], nan where unknown
+    heading        (R,) [rad], nan where unknown
+    length, width  (R,) [m], nan where objects are points
+    kind           (R,) index of its kind, as in the model
+    """
+
+    time: Floats
+    offset: Ints
+    label: Ints
+    x: Floats
+    y: Floats
+    vx: Floats
+    vy: Floats
+    heading: Floats
+    length: Floats
+    width: Floats
+    kind: Ints
+
+    @property
+    def position(self) -> Floats:
+        """(R, 2) [m]."""
+        return np.stack([self.x, self.y], -1)
+
+
 def join_tracks(points: list[Floats], headings: list[Floats] | None) -> Tracks:
     """Put single tracks, each (n, 2) with headings (n,), behind one another."""
     offsets = np.cumsum([0] + [len(p) for p in points])

@@ -114,7 +114,7 @@ class HasObjects(Protocol):
     unseen(scan) -> a group of components for each measurement: near it, weight times density is the intensity of
         objects not seen before, as far as this measurement can tell where (no components: it cannot)
     arrivals(seconds) -> objects that came at known places in this time; their labels are not read
-    check(scans) -> the scans in the order given, raising InputError where one cannot be used
+    check(scan) raises InputError for a scan that cannot be used
     """
 
     @property
@@ -133,6 +133,8 @@ class HasObjects(Protocol):
     def unseen(self, scan: Any) -> Components: ...
 
     def arrivals(self, seconds: float) -> Bernoullis: ...
+
+    def check(self, scan: Any) -> None: ...
 
 
 def no_components(size: int, num_groups: int = 0) -> Components:

@@ -189,22 +189,33 @@ def find_samples(cues, table, step, near):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
-def score_groups(paper, cues, group, near, offset, table, out, changes):  # type: ignore[no-untyped-def]
+def score_groups(paper, cues, group, near, offset, table, out, changes, rows=None, weights=None):  # type: ignore[no-untyped-def]
     """Log densities of groups, out (G,), at offsets (G,) [m], and the probability of each to change lanes, (G,).
 
-    near  (N,) the sample of the table that each cue is scored about"""
-    rows, there = np.empty((0, LOCAL)), np.zeros(len(offset))
+    near     (N,) the sample of the table that each cue is scored about
+    rows     (2, N, RESIDUALS, LOCAL) of every cue if it follows the road, and if its vehicle changes lanes; the latter
+             are not filled where it cannot
+    weights  (2, N) probabilities of both"""
+    none, there = np.empty((0, LOCAL)), np.zeros(len(offset))
     out[:] = 0.0
     changes[:] = 0.0
     for n in range(len(cues)):
         g, k = group[n], near[n]
-        out[g] += score_cue(paper, cues, n, offset[g], table, k, rows)[0]
+        if weights is None:  # known when this is compiled
+            out[g] += score_cue(paper, cues, n, offset[g], table, k, none)[0]
+        else:
+            height, weights[0, n] = score_cue(paper, cues, n, offset[g], table, k, rows[0, n])
+            out[g] += height
         if cues[n, CHANGES] > 0.0:
             changes[g] = cues[n, CHANGES]
-            there[g] += exact_cue(cues, n, offset[g], table, k, True, rows)[0]
+            there[g] += exact_cue(cues, n, offset[g], table, k, True, none if rows is None else rows[1, n])[0]
     for g in range(len(offset)):
         if changes[g] > 0.0:
             out[g], changes[g] = with_changes(changes[g], out[g], there[g])
+    if weights is not None:
+        for n in range(len(cues)):
+            weights[0, n] *= 1.0 - changes[group[n]]
+            weights[1, n] = changes[group[n]]
 
 
 @nb.njit(error_model="numpy")

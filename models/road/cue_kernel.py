@@ -115,7 +115,7 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     elif seen > 0.0:
         log_density = height + math.log(root * seen)
     else:
-        log_density = height + math.log(root) + normal_share(sight)[0]
+        log_density = height + math.log(root) + normal_share(sight, seen)[0]
     if len(rows) == 0:
         return log_density, weight
     rows[:] = 0.0
@@ -127,7 +127,7 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * precision, -precision
     rows[2, 4] = -along * precision
     if sight < FAR_INSIDE:
-        _, mills, bent = normal_share(sight)
+        _, mills, bent = normal_share(sight, seen)
         pull = math.sqrt(bent)
         unlike = 2.0 * (variance - spread) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
         slant_turn = (unlike + 2.0 * slant * skew) / variance  # d slant / d heading
@@ -142,12 +142,11 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
 
 
 @nb.njit(error_model="numpy")
-def normal_share(x):  # type: ignore[no-untyped-def]
-    """log Phi(x), its slope phi / Phi, and minus its second derivative."""
-    if x > UNDERFLOW:
-        log_share = math.log(0.5 * math.erfc(-x * ROOT_HALF))
-        slope = math.exp(-0.5 * x * x - LOG_ROOT - log_share)
-        return log_share, slope, slope * (x + slope)
+def normal_share(x, share):  # type: ignore[no-untyped-def]
+    """log Phi(x), its slope phi / Phi, and minus its second derivative; share is Phi(x), or 0 past UNDERFLOW."""
+    if share > 0.0:
+        slope = math.exp(-0.5 * x * x - LOG_ROOT) / share
+        return math.log(share), slope, slope * (x + slope)
     y = 1.0 / (x * x)
     series = -y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y)))
     log_share = -0.5 * x * x - math.log(-x) - LOG_ROOT + math.log1p(series)

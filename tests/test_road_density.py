@@ -18,7 +18,7 @@ from models.clothoid import Clothoid, evaluate, hermite, sample
 from models.program import InputError, log_joint, simulate
 from models.road.along_road import CuesAlongRoad
 from models.road.course import RoadCourse
-from models.road.cue_kernel import normal_share
+from models.road.cue_kernel import UNDERFLOW, normal_share
 from models.road.evidence import RoadEvidence
 from models.road.kernel import NO_ROAD
 from models.road.numbers import log_volumes, number_moments, to_courses, to_numbers
@@ -211,7 +211,8 @@ def test_the_end_of_sight_weighs_by_its_own_curvature() -> None:
     """Minus the second derivative of log Phi by differences, near and far beyond where it underflows."""
     for x in (-1e4, -50.0, -30.1, -29.9, -3.0, 0.0, 2.0, 6.0):
         step = 1e-3 * max(1.0, abs(x) * 1e-3)
-        below, here, above = (normal_share(x + d) for d in (-step, 0.0, step))
+        points = (x - step, x, x + step)
+        below, here, above = (normal_share(at, ndtr(at) if at > UNDERFLOW else 0.0) for at in points)
         assert here[1] == pytest.approx((above[0] - below[0]) / (2 * step), rel=1e-5)
         assert here[2] == pytest.approx(-(above[1] - below[1]) / (2 * step), rel=1e-4, abs=1e-9)
 

@@ -38,7 +38,7 @@ from scipy.special import ndtri
 from models.capability import Chart, Factors, Hyper, Squares
 from models.program import InputError
 from models.road.along_road import CuesAlongRoad, cue_arrays, kernel_settings
-from models.road.cue_kernel import SPREADS
+from models.road.cue_kernel import CHANGES, SPREADS
 from models.road.cues import KINDS, CueKind, Cues
 from models.road.evidence import RoadEvidence, road_evidence
 from models.road.hyper import hyper
@@ -123,6 +123,8 @@ class RoadCourse:
         course, num, paper, cues, group = self._kernel(evidence)
         centre, scale = np.r_[np.zeros(6), loc], np.r_[np.ones(6), std]
         roads, sharp = first_roads(self.prior), cues[:, SPREADS].copy()
+        chance = cues[:, CHANGES].copy()
+        cues[:, CHANGES] = 0.0  # in thick fog a vehicle that changes lanes looks like one that does not
         x = np.concatenate([roads, np.zeros((len(roads), len(loc)))], 1)
         cues[:, SPREADS] = sharp + FOGS[0] ** 2
         heights = np.empty((len(x), 1 + len(loc)))
@@ -131,6 +133,8 @@ class RoadCourse:
         hessian, gradient = np.zeros((len(best), len(best))), np.empty(len(best))
         for fog in FOGS:
             cues[:, SPREADS] = sharp + fog**2
+            if fog == FOGS[-1]:
+                cues[:, CHANGES] = chance
             normal_equations(centre + scale * best, course, num, paper, cues, group, hessian, gradient)  # type: ignore[call-arg]
             whole = np.eye(len(best)) + scale[:, None] * hessian * scale
             best = best - dposv(whole, best + scale * gradient, lower=1)[1]

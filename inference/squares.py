@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from inference.arrow import Factor, arrow, colour, factorise, half_log_determinant, solve, squared_norm, variances
 from inference.posterior import Posterior, Snapshots
+from inference.refusal import accept
 from models.capability import HasSquares, Squares
 from models.program import InputError
 
@@ -161,6 +162,7 @@ def run(
     """Minimise, then draw from the Laplace posterior, as inference.least_squares.run does and says."""
     began = time.perf_counter()
     squares = model.squares(evidence)
+    accept()
     if init is None and hasattr(model, "start"):
         init = model.start(evidence)
     if init is not None and squares.sites.keys() - init.keys():

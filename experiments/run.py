@@ -118,6 +118,8 @@ def run(
     with stage("engine"):
         posterior = _infer(engine, model, evidence, engine_seed(seed))
     seconds["engine, processor"] = time.process_time() - worked
+    if hasattr(model, "labels"):
+        posterior = replace(posterior, labels=model.labels(evidence))
     say(f"posterior  {' x '.join(map(str, posterior.shape))} draws in {seconds['engine']:.2f} s")
     with stage("metrics"):
         scores = {name: float(value) for name, value in collect("metric", metrics, posterior, scene).items()}

@@ -40,7 +40,7 @@ from models.program import InputError
 from models.road.along_road import CuesAlongRoad, cue_arrays, kernel_settings
 from models.road.cue_kernel import SPREADS
 from models.road.cues import KINDS, CueKind, Cues
-from models.road.evidence import RoadEvidence, road_evidence
+from models.road.evidence import COURSE_LABELS, RoadEvidence, offset_labels, road_evidence
 from models.road.hyper import hyper
 from models.road.kernel import density_slopes, group_densities, normal_equations
 from models.road.numbers import log_volumes, number_moments, prior_root, to_courses, to_numbers
@@ -103,6 +103,10 @@ class RoadCourse:
         course = pyro.sample("course", dist.MultivariateNormal(mean, scale_tril=tril))
         offset = pyro.sample("offset", dist.Normal(loc, std).to_event(1))
         pyro.sample("cues", CuesAlongRoad(self, evidence, course, offset), obs=evidence.cues)
+
+    def labels(self, evidence: RoadEvidence) -> dict[str, tuple[str, ...]]:
+        """What the numbers of each site are."""
+        return {"course": COURSE_LABELS, "offset": offset_labels(evidence)}
 
     @property
     def num_samples(self) -> int:

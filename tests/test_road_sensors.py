@@ -72,3 +72,15 @@ def test_a_vehicle_that_changes_lanes_is_recognised_and_counts_for_little() -> N
     near, wrong = (np.median(v, 0)[1] / np.median(without, 0)[1] for v in (wary, misled))  # 80 m ahead
     assert near < 1.25
     assert wrong > 1.5
+
+
+def test_a_vehicle_is_remarked_where_it_rather_leaves_the_road(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = night_road(SEEDS[0], lane_change=True)
+    evidence = MODEL.prepare(scene.data)
+    first = int(evidence.group[evidence.moves][0])
+    for share, told in ((0.45, 1), (0.55, 0)):
+        follows = np.where(evidence.group == first, share, 0.9)
+        monkeypatch.setattr(RoadCourse, "follows", lambda *_, found=follows: found)
+        remarks = MODEL.remarks(evidence, {})
+        assert len(remarks) == told
+        assert all(remark.startswith(f"{evidence.names[first]} changes lanes") for remark in remarks)

@@ -191,19 +191,19 @@ class RoadCourse:
         return CuesAlongRoad(self, evidence, course, offset).whitened(evidence.cues)[..., 2].nanmean(0).numpy()
 
     def remarks(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> list[str]:
-        """What speaks against the draws, in words: vehicles that rather change lanes, or turn off, than follow the road;
-        and more cues taken for clutter than there can be, which tells of a wrong mode.
+        """What speaks against the draws, in words: vehicles that rather change lanes, or turn off, than follow the
+        road; and more cues taken for clutter than there can be, which tells of a wrong mode.
 
         m of n cues are too many where Binomial(n, clutter) has m or more with a probability below IMPLAUSIBLE."""
         follows = self.follows(evidence, draws)
         shares = {int(g): follows[evidence.group == g].mean() for g in np.unique(evidence.group[evidence.moves])}
         rest = follows[~np.isin(evidence.group, [g for g, share in shares.items() if share < SUSPECT])]
-        lost = int((1.0 - rest).sum()) if len(rest) else 0
+        lost = int(np.nansum(1.0 - rest))
         found = []
         if binom.sf(lost - 1, len(rest), self.clutter) < IMPLAUSIBLE:
             found.append(
-                f"{lost} of {len(rest)} cues are taken for clutter, where {self.clutter:.0%} are expected: there may be "
-                "another road that explains them; compare with engine=importance_prior, or raise clutter"
+                f"{lost} of {len(rest)} cues are taken for clutter, where {self.clutter:.0%} are expected: another "
+                "road may explain them; compare with engine=importance_prior, or raise clutter"
             )
         return found + [
             f"{evidence.names[g]} changes lanes or turns off (it follows the road with a probability of {share:.2g}) "

@@ -116,7 +116,7 @@ def plan(words: list[str]) -> Plan:
     numbers, names = {"scenes": 60, "held_out": 30, "num_draws": 200, "num_rounds": 15}, list[str]()
     rest, held = [["engine=importance"]], [list[str]()]
     for word in words:
-        override = OverridesParser.create().parse_override(word)
+        (override,) = OverridesParser.create().parse_overrides([word])
         key = override.key_or_group
         if key in numbers:
             value = override.value()
@@ -125,7 +125,7 @@ def plan(words: list[str]) -> Plan:
                 raise ConfigError(f"{key} is '{value}'; give a whole number, {least} or more")
             numbers[key] = value
         elif key == "learn":
-            value = override.value()
+            value = list(override.sweep_string_iterator()) if override.is_sweep_override() else override.value()
             names = [str(name) for name in (value if isinstance(value, list) else [value])]
             if not names:
                 raise ConfigError("learn is empty; name settings, such as learn=[clutter,delineator], or leave it out")

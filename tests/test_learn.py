@@ -59,6 +59,8 @@ def test_what_was_learnt_runs_as_an_experiment(
         (["held_out=none"], "held_out is 'none'; give a whole number"),
         (["num_draws=5"], "num_draws is 5; learning needs 20 or more"),
         (["learn=[]"], "learn is empty"),
+        (["learn=[clutter"], "cannot read the setting 'learn=[clutter'"),
+        (["learn=clutter,bicycle"], "'bicycle' cannot be learnt"),
         (["learn=[delineatr.std]"], "did you mean 'delineator.std'?"),
         (["learn=bicycle"], "'bicycle' cannot be learnt: no scene has a bicycle"),
         (["scenario.seed=3"], "learning numbers its scenes itself"),

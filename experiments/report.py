@@ -11,6 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
 
 from experiments.command import in_short
@@ -18,6 +19,7 @@ from experiments.signatures import source_of
 
 if TYPE_CHECKING:
     from experiments.run import Result
+    from inference.posterior import Posterior
 
 UNITS = {
     "m": "m", "cm": "cm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
@@ -69,7 +71,7 @@ def write_report(
         _scores(result.scores, manifest["config"].get("metrics", [])) if result.scores else unscored,
         "".join(f"<h2>{_words(name)}</h2>{image}" for name, image in images.items()),
         "<h2>Convergence</h2>",
-        _by_name(result.diagnostics),
+        _by_name(_labelled(result.posterior, result.diagnostics)),
         "<h2>Engine</h2>",
         engine_tables(info, result.posterior.log_evidence),
         "<h2>Time</h2>",
@@ -122,6 +124,17 @@ def meanings(scores: Iterable[str], modules: Iterable[str]) -> dict[str, str]:
     text = "\n".join(file.read_text() for module in dict.fromkeys(modules) if (file := source_of(module)))
     lines = {name: re.search(rf"^ +{re.escape(name)}  +(\S.*)$", text, re.MULTILINE) for name in scores}
     return {name: line[1] for name, line in lines.items() if line}
+
+
+def _labelled(posterior: Posterior, diagnostics: dict[str, Any]) -> dict[str, Any]:
+    """Numbers with what people call them before their names, where the labels say."""
+    labels = {
+        f"{site}{list(index)}" if index else site: posterior.label(site, index)
+        for site in posterior.labels
+        if site in posterior.draws
+        for index in np.ndindex(posterior.draws[site].shape[2:])
+    }
+    return {f"{labels[name]}, {name}" if name in labels else name: row for name, row in diagnostics.items()}
 
 
 def _words(name: str) -> str:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from experiments.box_overlap import overlap
-from experiments.kitti_boxes import to_camera, to_world
-from experiments.kitti_matching import TrackBoxes, boxes_of
+from experiments.kitti_boxes import in_view, to_camera, to_world
+from experiments.kitti_matching import TrackBoxes
 from experiments.scenarios.kitti_tracking import KittiSequence, frames_of
 
 Floats = NDArray[np.float64]
@@ -42,17 +42,20 @@ def track(
     max_age: int = 2,
     least_score: float = -np.inf,
     compensate: bool = True,
+    only_in_view: bool = False,
 ) -> TrackBoxes:
     """Boxes that the baseline reports in a sequence, causally; a track's score is that of its last detection.
 
-    gate         least IoU of a detection with the predicted box
-    min_hits     detections before a track is reported; the first frames of a sequence are exempt
-    max_age      frames without a detection after which a track is dropped; it is reported in fewer
-    least_score  detections below are not looked at
-    compensate   whether to track in the frame of the poses, or in the moving camera's as AB3DMOT did at first"""
+    gate          least IoU of a detection with the predicted box
+    min_hits      detections before a track is reported; the first frames of a sequence are exempt
+    max_age       frames without a detection after which a track is dropped; it is reported in fewer
+    least_score   detections below are not looked at
+    compensate    whether to track in the frame of the poses, or in the moving camera's as AB3DMOT did at first
+    only_in_view  whether to report nothing that is beside the image; AB3DMOT reports it"""
     detections, still = sequence.detections, np.eye(4)[None]
-    pose = sequence.pose if compensate else np.tile(still, (len(sequence.time), 1, 1))
-    position, heading = to_world(detections.camera, pose[frames_of(detections.offset)])
+    if not compensate:
+        sequence = sequence._replace(pose=np.tile(still, (len(sequence.time), 1, 1)))
+    position, heading = to_world(detections.camera, sequence.pose[frames_of(detections.offset)])
     boxes = to_camera(position, heading, detections.size, still)  # axes of the camera, origin of the poses
     x, P = np.zeros((0, SIZE)), np.zeros((0, SIZE, SIZE))
     label, hits, age, score = (np.zeros(0, kind) for kind in (np.int64, np.int64, np.int64, np.float64))
@@ -75,11 +78,13 @@ def track(
         x, P, label, hits, age, score = (values[alive] for values in (x, P, label, hits, age, score))
         shown = np.flatnonzero((hits >= min_hits) | (t < min_hits))
         reported.append((label[shown], x[shown][:, TO_BOX], score[shown]))
-    offset = np.cumsum([0] + [len(labels) for labels, _, _ in reported])
-    labels, found, scores = (np.concatenate(parts) for parts in zip(*reported, strict=True))
-    position, heading = to_world(found, np.broadcast_to(still, (len(found), 4, 4)))
-    moved = sequence._replace(pose=pose)
-    return boxes_of(moved, offset, labels, position, heading, found[:, :3], scores)
+    frame = np.repeat(np.arange(len(reported)), [len(labels) for labels, _, _ in reported])
+    label, box, score = (np.concatenate(parts) for parts in zip(*reported, strict=True))
+    position, heading = to_world(box, np.broadcast_to(still, (len(box), 4, 4)))
+    box = to_camera(position, heading, box[:, :3], sequence.pose[frame])
+    shown = in_view(box, sequence.projection, sequence.image) | (not only_in_view)
+    offset = np.searchsorted(frame[shown], np.arange(len(reported) + 1))
+    return TrackBoxes(offset, label[shown], box[shown], score[shown])
 
 
 def predict(x: Floats, P: Floats) -> tuple[Floats, Floats]:

@@ -9,8 +9,9 @@ as possible reach an IoU of 0.25 and their IoU is largest in sum. Then do not co
     boxes    that are not paired and are 25 px or less high in the image, or more than half inside a region where
              nothing is labelled
 
-The image box is what the reported box covers of the image (experiments.kitti_boxes): that is what the detector's own
-image boxes are too. A box that is not in view has no height, and so does not count unless it is paired.
+The image box is what the reported box covers of the image (experiments.kitti_boxes.image_boxes): that is what the
+detector's own image boxes are too, and where a track coasts there is no other. A box beside the image counts, and is
+false: a tracker has to know what the camera can see (experiments.kitti_boxes.in_view).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A baseline on KITTI's cars, a Kalman filter a car and nearest neighbours: python -m benchmarks.kitti_baseline
 
-    --quick          3 of the 13 sequences
-    --json           one JSON object on the standard output and nothing else
-    --only KEY,KEY   only the measurements that yield these figures"""
+--quick          3 of the 13 sequences
+--json           one JSON object on the standard output and nothing else
+--only KEY,KEY   only the measurements that yield these figures"""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Effort(NamedTuple):
 
 
 def baseline(effort: Effort) -> Values:
-    """The baseline with the threshold of track scores that is best on the labels, as AB3DMOT's figures are, and without."""
+    """The baseline, with the threshold of track scores that is best on the labels, as AB3DMOT's figures have it."""
     from experiments.kitti_baseline import track
     from experiments.kitti_evaluation import best_threshold, compare_all, evaluate
     from experiments.scenarios.kitti_tracking import kitti_tracking, sequences

@@ -1,4 +1,4 @@
-"""Boxes of vehicles between KITTI's camera frame, the frame of the poses and the image: the one home of the conversions.
+"""Boxes of vehicles between KITTI's camera frame, the frame of the poses and the image: the home of the conversions.
 
 A box of the camera frame is KITTI's row (h, w, l, x, y, z, rot_y): height, width, length [m], the middle of its bottom
 in the rectified camera frame (x right, y down, z forward) [m], and the rotation about y: its length points along
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # (x right, y down, z forward) -> forward, left, up
+AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # right, down, forward to forward, left, up
 NEAR = 0.3  # corners nearer to the plane of the camera, or behind it, are projected from here [m]
 # Corners of a box of length, height and width 1 about the middle of its bottom, (3, 8)
 UNIT = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-1.0, 0.0) for k in (-0.5, 0.5)]).T

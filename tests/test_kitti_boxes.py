@@ -92,7 +92,7 @@ def test_overlap_of_hand_worked_cases(moved: tuple[float, ...], iou: float) -> N
 
 def test_a_square_turned_by_45_degrees_shares_an_octagon() -> None:
     square = np.array([[1.0, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0]])
-    diamond = square + [0, 0, 0, 0, 0, 0, np.pi / 4]
+    diamond = square + np.array([0, 0, 0, 0, 0, 0, np.pi / 4])
     octagon = 8 * (np.sqrt(2) - 1)  # with an inscribed circle of radius 1
     np.testing.assert_allclose(overlap(square, diamond), octagon / (8 - octagon))
 

@@ -63,6 +63,13 @@ def test_all_frames_give_the_track_at_once_with_the_score_of_its_detections() ->
     assert evaluate([TRUTH], [found], average=False)["ids"] == 0
 
 
+def test_cars_that_come_one_after_the_other_are_tracks_of_their_own() -> None:
+    rows = [(t, 1.0, box) for t, _, box in CARS] + [(t, 1.0, car(8.0)) for t in range(3, NUM)]
+    found = track(detected(TRUTH, sorted(rows, key=lambda row: row[0])))
+    np.testing.assert_array_equal(np.diff(found.offset), [1, 1, 1, 1, 1, 2, 2, 2])
+    assert len(set(found.track)) == 2
+
+
 def test_a_threshold_and_an_empty_sequence_leave_nothing() -> None:
     assert len(track(TRUTH.data).track) == 0
     low = detected(TRUTH, [(t, -0.5, box) for t, _, box in CARS])

@@ -64,6 +64,7 @@ def test_an_image_box_goes_about_all_corners_and_is_cut_at_the_border() -> None:
 
 def test_what_is_beside_or_behind_the_camera_is_not_in_view() -> None:
     boxes = np.stack([car(), car(-14.0, 14.0), car(40.0, 10.0), car(0.0, -20.0), car(0.0, -1.0, -np.pi / 2)])
+    boxes[3:, 0] = 3.0  # as high as to be seen, were they ahead
     np.testing.assert_array_equal(in_view(boxes, PROJECTION, IMAGE), [True, True, False, False, True])
 
 

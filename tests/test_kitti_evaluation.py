@@ -175,32 +175,30 @@ def test_pairs_are_those_of_brute_force() -> None:
 
 
 def test_a_box_that_goes_frees_the_label_for_another() -> None:
-    some = crowded(3)
-    kept = np.ones(5, dtype=bool)
-    boxes = some.pairs[match(some, kept), 1]
-    kept[boxes[0]] = False
-    assert boxes[0] not in some.pairs[match(some, kept), 1] or match(some, kept)[0] == -1
+    truth = scene([(0, 7, car())], 1)
+    some = compare(truth.data, truth.truth, report([(0, 1, car(0.2)), (0, 2, car(0.8))], 1))
+    for kept, box in (([True, True], 0), ([False, True], 1)):
+        assert some.pairs[match(some, np.array(kept)), 1] == [box]
+    assert match(some, np.zeros(2, dtype=bool)) == [-1]
 
 
 # Over recall
 
 
 def test_averages_over_recall_are_worked_by_hand() -> None:
-    """Of 100 cars 60 are found, and 20 false tracks score less than all of them: at each of the 24 recalls below .6
-    nothing but what recall leaves out is missed; the last threshold, that of the last pair, lets no false one in."""
-    cars = [(t, 0, car(0.0, 20.0)) for t in range(100)]
-    rows = [(t, t, car(0.0, 20.0)) for t in range(60)] + [(t, t, car(8.0, 20.0)) for t in range(60, 80)]
-    tracks = report(rows, 100)._replace(score=np.concatenate([np.linspace(1.0, 0.5, 60), np.zeros(20)]))
-    compared = compare_all([scene(cars, 100)], [tracks])
-    steps = thresholds(compared)
-    assert len(steps) == 24 and steps[-1][0] == pytest.approx(0.5)
-    np.testing.assert_allclose([recall for _, recall in steps], np.arange(1, 25) / RECALLS)
-    expected = []
-    for score, recall in steps:
-        found = int((tracks.score >= score).sum())
-        switches = found - 1  # each frame has a track of its own
-        expected.append(np.clip(1 - (100 - found + switches - (1 - recall) * 100) / (recall * 100), 0, 1))
-    assert over_recall(compared)["samota"] == pytest.approx(sum(expected) / RECALLS)
+    """Of 400 cars 240 are found, each by a track of its own and with a score of its own, and 20 false boxes score less
+    than 40 of these: 10 more cars at each of 24 recalls, and from recall .525 on the false ones with them."""
+    cars = [(t, t, car()) for t in range(400)]
+    rows = [(t, t, car()) for t in range(240)] + [(t, t, car(8.0)) for t in range(240, 260)]
+    tracks = report(rows, 400)._replace(score=np.concatenate([np.arange(240.0, 0.0, -1.0), np.full(20, 40.5)]))
+    compared = compare_all([scene(cars, 400)], [tracks])
+    recall = np.arange(1, 25) / RECALLS
+    np.testing.assert_allclose(thresholds(compared), np.stack([241 - 400 * recall, recall], 1))
+    false = np.where(recall > 0.51, 20, 0)
+    averages = over_recall(compared)
+    assert averages["samota"] == pytest.approx((1 - false / (400 * recall)).sum() / RECALLS)
+    assert averages["amota"] == pytest.approx((recall - false / 400).sum() / RECALLS)
+    assert averages["amotp"] == pytest.approx(24 / RECALLS)
 
 
 def test_the_best_threshold_drops_false_tracks_by_their_mean_score() -> None:

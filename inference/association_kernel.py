@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from inference.association_exact import Plan, Problem, arrange, backward, forward, sample
-from inference.association_gibbs import walk_draw, weigh
+from inference.association_gibbs import walk_draw, walk_odds, weigh
 from inference.association_loopy import propagate
 from inference.association_matching import Matching, match
 from inference.association_random import uniform
@@ -29,7 +29,6 @@ Ints = NDArray[np.int64]
 AUTO, LOOPY, GIBBS = 0, 1, 2  # methods
 MISSED, IMPOSSIBLE = -1, -2  # in associations; the second where a group has none of positive weight
 NARROW = 3  # bits that are few enough not to look at the transpose
-MOST = 2.0**500  # of odds
 
 
 class Groups(NamedTuple):
@@ -251,7 +250,7 @@ def prepare(rows, max_shared, room):  # type: ignore[no-untyped-def]
     (problem, whether it is transposed, bits or more than max_shared)."""
     problem = upright(rows)
     width = arrange(problem, max_shared, room.plan)
-    if width <= NARROW:
+    if width <= min(NARROW, max_shared):
         return problem, False, width
     other = transpose(rows, room)
     other_width = arrange(other, min(width - 1, max_shared), room.plan)
@@ -342,47 +341,31 @@ def associate(  # type: ignore[no-untyped-def]
             log_sum, chosen, alone = sum_exactly(rows, max_shared, room, bits)
         if log_sum == -np.inf:
             num_approximate += 1
+            problem = upright(rows)
             if method == GIBBS:
-                log_sum = _by_walk(rows, matching, num_sweeps, random, room) - shift
+                odds = room.entry_vectors[1][: len(rows.column)]
+                walk_odds(problem, odds)
+                log_sum = weigh(
+                    problem,
+                    rows.cost,
+                    rows.alone_cost,
+                    odds,
+                    num_sweeps,
+                    random,
+                    matching.choice,
+                    matching.holder,
+                    chosen,
+                    alone,
+                )
+                log_sum -= shift  # it is that of the costs
             else:
                 mu, nu, rest = room.entry_vectors[1], room.entry_vectors[2], room.entry_vectors[3]
-                problem, sums = upright(rows), room.column_vector
+                sums = room.column_vector
                 log_sum, done = propagate(problem, tolerance, max_iterations, mu, nu, rest, sums, chosen, alone)
                 num_unconverged += not done
         log_partition += log_sum + shift
         _spread(g, groups, rows, offset, measurement, ratio, missed, chosen, alone, taken, free)
     return log_partition, num_approximate, num_unconverged
-
-
-@nb.njit(error_model="numpy")
-def _odds(rows, matching, room):  # type: ignore[no-untyped-def]
-    """Of the walk, in place of the scaled weights: (e,) and (n,)."""
-    odds, alone = room.entry_vectors[1], room.column_vector
-    for e in range(len(rows.column)):
-        odds[e] = min(2.0 ** (matching.row_price[rows.row[e]] - rows.cost[e]), MOST)
-    for i in range(len(rows.alone)):
-        alone[i] = 2.0 ** (matching.row_price[i] - rows.alone_cost[i])
-    return odds[: len(rows.column)], alone[: len(rows.alone)]
-
-
-@nb.njit(error_model="numpy")
-def _by_walk(rows, matching, num_sweeps, random, room):  # type: ignore[no-untyped-def]
-    odds, alone = _odds(rows, matching, room)
-    chosen, free = room.entry_vectors[0], room.row_vector
-    return weigh(
-        rows.offset,
-        rows.column,
-        rows.cost,
-        rows.alone_cost,
-        odds,
-        alone,
-        num_sweeps,
-        random,
-        matching.choice,
-        matching.holder,
-        chosen,
-        free,
-    )
 
 
 @nb.njit(error_model="numpy")
@@ -472,12 +455,12 @@ def choose(  # type: ignore[no-untyped-def]
             ahead = np.empty((n + 1) << width)
             exact = backward(problem, room.plan, width, ahead, ahead[n << width :]) > -np.inf
         num_approximate += not exact
-        odds, alone = _odds(rows, matching, room)
+        if not exact:
+            problem, odds = upright(rows), room.entry_vectors[0][: len(rows.column)]
+            walk_odds(problem, odds)
         for s in range(len(theta)):
             if not exact:
-                walk_draw(
-                    rows.offset, rows.column, odds, alone, num_sweeps, random, matching.choice, matching.holder, pick
-                )
+                walk_draw(problem, odds, num_sweeps, random, matching.choice, matching.holder, pick)
             elif across:
                 sample(problem, room.plan, width, ahead, random, room.column_choice)
                 for i in range(len(pick)):

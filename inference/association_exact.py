@@ -4,8 +4,8 @@
 
 Rows are passed one by one. What the rows to come need to know of those passed is which columns are taken, and only of
 columns that have rows on both sides: a column gets a bit at its first row and gives it back after its last. With b bits
-in use at most, time is (number of entries) 2^b. The order of the rows decides on b: the next row is one that needs no new bit, or
-the one after which the fewest stay in use. A chain of any length needs two bits.
+in use at most, time is (number of entries) 2^b. The order of the rows decides on b: the next row is one that needs no
+new bit, or the one after which the fewest stay in use. A chain of any length needs two bits.
 
 Rows and columns play the same part in Z, so that a problem may be solved by its transpose where this needs fewer bits:
 many rows on few columns, or few rows on many columns.

@@ -66,11 +66,12 @@ def walk_odds(problem, odds):  # type: ignore[no-untyped-def]
 
 @nb.njit(error_model="numpy")
 def weigh(  # type: ignore[no-untyped-def]
-    problem, cost, alone_cost, odds, num_sweeps, random, choice, holder, taken, free
+    problem, costs, odds, num_sweeps, random, choice, holder, taken, free
 ):
     """Fill the probabilities that an entry is taken (e,) and a row is alone (n,) from the distinct associations met by
-    a walk that starts at choice, the most probable one; returns the log of their summed weight. Costs are -log2 of the
-    weights that count."""
+    a walk that starts at choice, the most probable one; returns the log of their summed weight, costs being -log2 of
+    the weights that count, of entries (e,) and of being alone (n,)."""
+    cost, alone_cost = costs
     n, size = len(choice), 2
     while size < 2 * (num_sweeps + 1):
         size *= 2

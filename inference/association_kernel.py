@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 AUTO, LOOPY, GIBBS = 0, 1, 2  # methods
 MISSED, IMPOSSIBLE = -1, -2  # in associations; the second where a group has none of positive weight
+TINY = 5e-324  # keeps a track that cannot be alone from 0 / 0
+MASKS = 4
 NARROW = 3  # bits that are few enough not to look at the transpose
 
 
@@ -79,6 +81,7 @@ class Room(NamedTuple):
     entry_vectors: Array  # (4, .)
     row_choice: Ints
     column_choice: Ints
+    masks: Array  # for groups of up to MASKS bits
 
 
 @nb.njit(error_model="numpy")
@@ -150,7 +153,19 @@ def allocate(groups, offset, measurement):  # type: ignore[no-untyped-def]
     plans = np.empty((5, long + 1), np.int64)
     plan = Plan(plans[0], plans[1], plans[2], plans[3], plans[4])
     return Room(
-        local, short[5], rows, matching, across, ints[4], plan, reals[6], reals[7], floats[3:7], short[6], short[7]
+        local,
+        short[5],
+        rows,
+        matching,
+        across,
+        ints[4],
+        plan,
+        reals[6],
+        reals[7],
+        floats[3:7],
+        short[6],
+        short[7],
+        np.empty((long + 2) << MASKS if n > 0 else 0),
     )
 
 
@@ -260,26 +275,57 @@ def prepare(rows, max_shared, room):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
-def sum_exactly(rows, max_shared, room, bits):  # type: ignore[no-untyped-def]
-    """(log Z, taken (e,), free (n,)) of a group, -inf for the first where it needs more than max_shared bits."""
+def sum_exactly(rows, max_shared, room):  # type: ignore[no-untyped-def]
+    """Log Z of a group's scaled weights, -inf where it needs more than max_shared bits; for the rest see `_weigh`."""
     problem, across, width = prepare(rows, max_shared, room)
-    taken, other_taken, free = room.entry_vectors[0], room.entry_vectors[1], room.row_vector
     if width > max_shared:
-        return -np.inf, taken, free
-    n = len(problem.alone)
-    ahead = bits if len(bits) >= (n + 3) << width else np.empty((n + 3) << width)
-    value, reach = ahead[n << width : (n + 1) << width], ahead[(n + 1) << width : (n + 2) << width]
+        return -np.inf
+    n, free, spare = len(problem.alone), room.row_vector, room.column_vector
+    taken, other_taken = room.entry_vectors[0], room.entry_vectors[1]
+    ahead = room.masks if len(room.masks) >= (n + 2) << width else np.empty((n + 2) << width)
+    value, reach = ahead[n << width : (n + 1) << width], ahead[(n + 1) << width :]
     log_sum = backward(problem, room.plan, width, ahead, value)
     if log_sum == -np.inf:
-        return log_sum, taken, free
-    spare = room.column_vector
-    if across:
-        fine = forward(problem, room.plan, width, ahead, reach, value, other_taken, spare, free)
-        for e in range(len(rows.column)):
-            taken[room.across_entry[e]] = other_taken[e]
-    else:
-        fine = forward(problem, room.plan, width, ahead, reach, value, taken, free, spare)
-    return log_sum if fine else -np.inf, taken, free
+        return log_sum
+    if not across:
+        return log_sum if forward(problem, room.plan, width, ahead, reach, value, taken, free, spare) else -np.inf
+    if not forward(problem, room.plan, width, ahead, reach, value, other_taken, spare, free):
+        return -np.inf
+    for e in range(len(rows.column)):
+        taken[room.across_entry[e]] = other_taken[e]
+    return log_sum
+
+
+@nb.njit(error_model="numpy")
+def _finite(first, last, groups):  # type: ignore[no-untyped-def]
+    """Whether the tracks of a group have weights that can be summed."""
+    for i in range(first, last):
+        if not 0.0 < groups.total[groups.track[i]] < np.inf:
+            return False
+    return True
+
+
+@nb.njit(error_model="numpy")
+def _weigh(rows, ratio, method, max_shared, tolerance, max_iterations, num_sweeps, random, room):  # type: ignore[no-untyped-def]
+    """(log Z of a group, -inf where it has no association; whether it is approximate; whether it did not converge);
+    taken (e,) and alone (n,) are left in room.entry_vectors[0] and room.row_vector."""
+    matching, possible = pair(rows, room)
+    if not possible:
+        return -np.inf, False, False
+    shift = scale(rows, ratio, matching)
+    if method == AUTO:
+        log_sum = sum_exactly(rows, max_shared, room)
+        if log_sum > -np.inf:
+            return log_sum + shift, False, False
+    problem, taken, alone = upright(rows), room.entry_vectors[0], room.row_vector
+    if method == GIBBS:
+        odds, costs, start = room.entry_vectors[1][: len(rows.column)], (rows.cost, rows.alone_cost), matching.choice
+        walk_odds(problem, odds)
+        log_sum = weigh(problem, costs, odds, num_sweeps, random, start, matching.holder, taken, alone)
+        return log_sum, True, False
+    mu, nu, rest = room.entry_vectors[1], room.entry_vectors[2], room.entry_vectors[3]
+    log_sum, converged = propagate(problem, tolerance, max_iterations, mu, nu, rest, room.column_vector, taken, alone)
+    return log_sum + shift, True, not converged
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -307,81 +353,52 @@ def associate(  # type: ignore[no-untyped-def]
     its taken and free are all zero. No NaN comes out."""
     groups = split(offset, measurement, ratio, missed, num_measurements)
     room = allocate(groups, offset, measurement)
-    bits = np.empty(0)
     log_partition, num_approximate, num_unconverged = 0.0, 0, 0
     for g in range(len(groups.start) - 1):
         first, last = groups.start[g], groups.start[g + 1]
-        possible = True
-        for i in range(first, last):
-            possible = possible and 0.0 < groups.total[groups.track[i]] < np.inf
-        if last - first == 1 and possible:
-            t = groups.track[first]
-            total = groups.total[t]
-            log_partition += math.log(total)
-            free[t] = missed[t] / total
-            for k in range(offset[t], offset[t + 1]):
-                taken[k] = ratio[k] / total
-            continue
-        if possible:
-            rows = gather(g, groups, offset, measurement, ratio, missed, False, room)
-            matching, possible = pair(rows, room)
-        if not possible:
+        if not _finite(first, last, groups):
             log_partition = -np.inf
-            for i in range(first, last):
-                t = groups.track[i]
-                free[t] = 0.0
-                for k in range(offset[t], offset[t + 1]):
-                    taken[k] = 0.0
+        elif last - first == 1:
+            t = groups.track[first]
+            log_partition += math.log(groups.total[t])
+            free[t] = missed[t] / groups.total[t]
+            for k in range(offset[t], offset[t + 1]):
+                taken[k] = ratio[k] / groups.total[t]
             continue
-        shift = scale(rows, ratio, matching)
-        log_sum, chosen, alone = -np.inf, room.entry_vectors[0], room.row_vector
-        if method == AUTO:
-            if len(bits) == 0:
-                bits = np.empty((last - first + 3) << min(max_shared, 8))
-            log_sum, chosen, alone = sum_exactly(rows, max_shared, room, bits)
-        if log_sum == -np.inf:
-            num_approximate += 1
-            problem = upright(rows)
-            if method == GIBBS:
-                odds = room.entry_vectors[1][: len(rows.column)]
-                walk_odds(problem, odds)
-                log_sum = weigh(
-                    problem,
-                    rows.cost,
-                    rows.alone_cost,
-                    odds,
-                    num_sweeps,
-                    random,
-                    matching.choice,
-                    matching.holder,
-                    chosen,
-                    alone,
-                )
-                log_sum -= shift  # it is that of the costs
-            else:
-                mu, nu, rest = room.entry_vectors[1], room.entry_vectors[2], room.entry_vectors[3]
-                sums = room.column_vector
-                log_sum, done = propagate(problem, tolerance, max_iterations, mu, nu, rest, sums, chosen, alone)
-                num_unconverged += not done
-        log_partition += log_sum + shift
-        _spread(g, groups, rows, offset, measurement, ratio, missed, chosen, alone, taken, free)
+        else:
+            rows = gather(g, groups, offset, measurement, ratio, missed, False, room)
+            log_sum, approximate, unconverged = _weigh(
+                rows, ratio, method, max_shared, tolerance, max_iterations, num_sweeps, random, room
+            )
+            log_partition += log_sum
+            if log_sum > -np.inf:
+                num_approximate += approximate
+                num_unconverged += unconverged
+                _spread(g, groups, rows, offset, measurement, ratio, missed, room, taken, free)
+                continue
+        for i in range(first, last):
+            t = groups.track[i]
+            free[t] = 0.0
+            for k in range(offset[t], offset[t + 1]):
+                taken[k] = 0.0
     return log_partition, num_approximate, num_unconverged
 
 
 @nb.njit(error_model="numpy")
-def _spread(g, groups, rows, offset, measurement, ratio, missed, chosen, alone, taken, free):  # type: ignore[no-untyped-def]
+def _spread(g, groups, rows, offset, measurement, ratio, missed, room, taken, free):  # type: ignore[no-untyped-def]
     """Write a group's marginals into those of the table; that of being alone is divided among its parts."""
+    chosen, alone = room.entry_vectors[0], room.row_vector
     for i in range(len(rows.alone)):
         t, weight = groups.track[groups.start[g] + i], missed[groups.track[groups.start[g] + i]]
         for k in range(offset[t], offset[t + 1]):
             taken[k] = 0.0
             if ratio[k] > 0.0 and not groups.shared[measurement[k]]:
                 weight += ratio[k]
-        share = alone[i] / weight if weight > 0.0 else 0.0
-        free[t] = missed[t] * share
+        weight = max(weight, TINY)
+        free[t] = missed[t] / weight * alone[i]
         for k in range(offset[t], offset[t + 1]):
             if not groups.shared[measurement[k]]:
-                taken[k] = ratio[k] * share
+                taken[k] = ratio[k] / weight * alone[i]
         for e in range(rows.offset[i], rows.offset[i + 1]):
             taken[rows.entry[e]] = chosen[e]
 
@@ -430,9 +447,7 @@ def choose(  # type: ignore[no-untyped-def]
     num_approximate, none = 0, np.full(1, -1)
     for g in range(len(groups.start) - 1):
         first, last = groups.start[g], groups.start[g + 1]
-        possible = True
-        for i in range(first, last):
-            possible = possible and 0.0 < groups.total[groups.track[i]] < np.inf
+        possible = _finite(first, last, groups)
         if possible and last - first > 1:
             rows = gather(g, groups, offset, measurement, ratio, missed, not draw, room)
             matching, possible = pair(rows, room)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import base64
 import math
 import re
+import statistics
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,8 @@ UNITS = {
     "m": "m", "cm": "cm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
     "sd": "sd", "nats": "nats", "pct": "%", "hz": "Hz",
 }  # fmt: skip
+
+LISTED = 100  # values of a list that are all told
 
 WORDS = {"r_hat": "R-hat", "ess_bulk": "effective draws", "mcse": "standard error of the mean"}
 
@@ -196,8 +199,16 @@ def engine_tables(info: dict[str, Any], log_evidence: float | None) -> str:
         if isinstance(values, dict) and values and name != "flags":
             parts.append(f"<h2>{_words(name)}</h2>{_by_name(values)}")
         elif isinstance(values, list | tuple) and values and name != "flags":
-            parts.append(f"<h2>{_words(name)}</h2><p>{escape(', '.join(map(number, values)))}</p>")
+            parts.append(f"<h2>{_words(name)}</h2><p>{escape(listed(values))}</p>")
     return "".join(parts)
+
+
+def listed(values: Sequence[Any]) -> str:
+    """All of a few values; of many numbers what they are about."""
+    if len(values) <= LISTED or not all(isinstance(value, int | float) for value in values):
+        return ", ".join(map(number, values))
+    told = {"median": statistics.median(values), "least": min(values), "most": max(values)}
+    return f"{len(values)} values: " + ", ".join(f"{name} {number(value)}" for name, value in told.items())
 
 
 def _by_name(values: dict[str, Any]) -> str:

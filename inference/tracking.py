@@ -73,11 +73,11 @@ def track(
     cannot use."""
     if not len(scans):
         raise InputError("a filter needs at least one scan, but got none; wait for the first")
+    scans = model.check(scans)
     past, told, seconds, now = list[Past](), list[Objects](), list[float](), list[float]()
     log_factor, loopy, left_out, late, too_late = 0.0, 0, 0.0, 0, 0
     with Progress("tracking", len(scans), progress) as bar, announce("compiling the filter", after=4.0):
         for number, scan in enumerate(scans):
-            model.check(scan)
             begin = time.perf_counter()
             if belief.time is not None and scan.time < belief.time - patience:
                 too_late += 1

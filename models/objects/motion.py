@@ -25,6 +25,7 @@ Scalars = Sequence[Any]
 ANGLES = {
     "heading": 2 * math.pi,
     "bearing": 2 * math.pi,
+    "axis": math.pi,
 }  # entries of states and measurements that are angles, and their period
 
 

@@ -34,8 +34,8 @@ def test_numbers_of_a_drive_are_named_by_frame() -> None:
     frames = model.prepare(night_drive(seed=0).data)[:3]
     posterior = particle_filter.run(model, frames, seed=0, num_particles=20)
     labelled = Posterior(posterior.draws, labels=model.labels(frames))
-    assert labelled.label("course", (2, 3)) == "frame 2: end x [m]"
-    assert labelled.label("road", (0, 3)) == "frame 0: curvature rate [1/m²]"
+    assert labelled.title("course", (2, 3)) == "frame 2: end x [m]"
+    assert labelled.title("road", (0, 3)) == "frame 0: curvature rate [1/m²]"
     for site, names in labelled.labels.items():
         assert len(names) == np.prod(labelled.draws[site].shape[2:])
 

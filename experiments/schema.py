@@ -21,7 +21,7 @@ from omegaconf import MISSING, BooleanNode, Container, DictConfig, IntegerNode, 
 
 from experiments.signatures import ConfigError, Knob, knobs, locate
 
-SUPPLIED = frozenset({"model", "evidence", "scene", "posterior", "posteriors", "seed"})  # by run(), to partial targets
+SUPPLIED = frozenset({"model", "evidence", "scans", "scene", "posterior", "posteriors", "seed"})  # by run(), to partial targets
 
 
 class UnknownKnob(ConfigError):

@@ -16,8 +16,8 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlacedReadings:
-    """A function of a recording: time [s] and positions (M, 2) in the world [m] of the measurements of each scan, by the
-    sensors of `traffic`; none of sensors that cannot begin a track, for they place objects too vaguely."""
+    """A function of a recording: time [s] and positions (M, 2) in the world [m] of the measurements of each scan, by
+    the sensors of `traffic`; none of sensors that cannot begin a track, for they place objects too vaguely."""
 
     traffic: Traffic
 

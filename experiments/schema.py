@@ -21,7 +21,9 @@ from omegaconf import MISSING, BooleanNode, Container, DictConfig, IntegerNode, 
 
 from experiments.signatures import ConfigError, Knob, knobs, locate
 
-SUPPLIED = frozenset({"model", "evidence", "scans", "scene", "posterior", "posteriors", "seed"})  # by run(), to partial targets
+SUPPLIED = frozenset(  # by run(), to partial targets
+    {"model", "evidence", "scans", "scene", "posterior", "posteriors", "seed"}
+)
 
 
 class UnknownKnob(ConfigError):

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 STEP = 0.2  # between scans [s]
 SPEED = 12.0  # [m/s]
 SWAY, KEEPING = 0.05, 4.0  # standard deviation of the own velocity [m/s], and how long it is kept [s]
-APART = 6.0  # times `spacing`, of those that have yet to meet
+APART = 3.0  # times `spacing`, of those that have yet to meet
 MIDDLE = (0.3, 0.7)  # share of the time between which they are close
 EXTENT = 250.0  # half width of the square in which false alarms are [m]
 

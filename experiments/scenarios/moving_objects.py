@@ -57,13 +57,12 @@ def see(model: Traffic, sensor: str, world: World, t: int, pose: Floats, rng: np
 
 
 def in_view(sensors: tuple[Sensor, ...], motion: Motion, world: World, pose: Floats) -> NDArray[np.bool_]:
-    """(T, N) whether any of the sensors, on a car at pose (T, 3), is likelier than not to reach an object."""
+    """(T, N) whether an object is within the view of any of the sensors, on a car at pose (T, 3)."""
     inside = np.zeros(world.state.shape[:2], dtype=bool)
     for t, own in enumerate(pose):
         body = motion.body(tuple(world.state[t].T), np)
         for sensor in sensors:
-            reached = sensor.detect(body, tuple(mounted(own, sensor.mount)), sensor.settings, np)
-            inside[t] |= reached > 0.5 * sensor.detection
+            inside[t] |= sensor.view(body, tuple(mounted(own, sensor.mount)), sensor.settings[3:], np) > 0.5
     return inside
 
 

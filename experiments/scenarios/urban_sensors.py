@@ -31,7 +31,7 @@ STEP = 0.01  # of the clock on which everything happens [s]
 PLACE = (5.0, 180.0, 95.0)  # where road users keep to: x from, x to, |y| up to, from the car [m]
 TURN = 0.4  # the most that they turn back with [rad/s]
 PULL = 0.02  # back to the usual speed of a kind [1/s^2]
-BAD_WEATHER = 0.4  # what is left of the camera's probability of detection
+BAD_WEATHER = 0.9  # the mass it gives to the camera's not detecting: of .85, .36 is left
 
 
 class Habit(NamedTuple):
@@ -102,7 +102,7 @@ def urban_sensors(
     kinds        of which there are some, in the order of the model's kinds
     sensors      that the car has
     dropout      a sensor that says nothing from `dropout_from` to `dropout_to` [s]
-    bad_weather  the camera detects 40 % of what it would
+    bad_weather  the camera detects .36 of what it sees, not .85
     latency      of the camera's scans [s]: they arrive so much after they were taken, other sensors' at once
     raw_laser    simulate the laser's beams on rectangles that hide each other, and send the middles of fitted boxes
 
@@ -113,9 +113,8 @@ def urban_sensors(
     ticks = np.unique(np.concatenate(list(clocks.values())))
     world = road_users(ticks, number, kinds, np.random.default_rng(way_seed))
     own = suite(kinds, sensors)
-    left = {"camera": BAD_WEATHER} if bad_weather else {}
-    there = tuple(replace(s, detection=left.get(s.name, 1.0) * s.detection) for s in own)
-    model = Traffic(there, ConstantTurn(), tuple(Kind(name=kind) for kind in kinds))
+    there = tuple(replace(s, weather=BAD_WEATHER) if bad_weather and s.name == "camera" else s for s in own)
+    model = Traffic(there, ConstantTurn(), tuple(Kind(name=kind, share=1 / len(kinds)) for kind in kinds))
     pose, scans, arrival = np.zeros(3), list[Scan](), list[float]()
     for sensor, own_seed in zip(SUITE, scan_seeds, strict=True):
         rng = np.random.default_rng(own_seed)

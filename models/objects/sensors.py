@@ -72,13 +72,12 @@ class Sensor:
         """(d,) of angles, inf else."""
         return np.array([ANGLES.get(name, math.inf) for name in self.names])
 
-    @property
-    def settings(self) -> tuple[float, ...]:
-        """The numbers that p_D depends on, in the order that `detect` reads them."""
+    def settings(self, kind: str) -> tuple[float, ...]:
+        """The numbers that h and p_D of a kind depend on, in the order that `measure` and `detect` read them."""
         return (self.detection, self.angle / 2, *self.reach, *self.edge)
 
     @staticmethod
-    def measure(body: Body, at: Scalars, ops: Any) -> Scalars:
+    def measure(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Scalars:
         """h, (d,)."""
         raise NotImplementedError
 
@@ -146,12 +145,11 @@ class Position(Sensor):
     extent: float = 1000.0
     names: ClassVar[tuple[str, ...]] = ("x", "y")
 
-    @property
-    def settings(self) -> tuple[float, ...]:
+    def settings(self, kind: str) -> tuple[float, ...]:
         return (self.detection, *self.middle, self.extent, self.edge[1])
 
     @staticmethod
-    def measure(body: Body, at: Scalars, ops: Any) -> Scalars:
+    def measure(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Scalars:
         return (body.x, body.y)
 
     @staticmethod
@@ -175,7 +173,7 @@ class RangeBearing(Sensor):
     names: ClassVar[tuple[str, ...]] = ("range", "bearing")
 
     @staticmethod
-    def measure(body: Body, at: Scalars, ops: Any) -> Scalars:
+    def measure(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Scalars:
         dx, dy = body.x - at[0], body.y - at[1]
         return (ops.sqrt(dx * dx + dy * dy + 1e-9), ops.atan2(dy, dx) - at[2])
 
@@ -200,9 +198,9 @@ class Radar(RangeBearing):
     names: ClassVar[tuple[str, ...]] = ("range", "bearing", "range_rate")
 
     @staticmethod
-    def measure(body: Body, at: Scalars, ops: Any) -> Scalars:
+    def measure(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Scalars:
         dx, dy = body.x - at[0], body.y - at[1]
-        distance, bearing = RangeBearing.measure(body, at, ops)
+        distance, bearing = RangeBearing.measure(body, at, settings, ops)
         return (distance, bearing, (dx * body.vx + dy * body.vy) / distance)
 
     @property

@@ -54,6 +54,7 @@ class Kind:
     yaw_rate_std: float = 0.2
     acceleration_std: float = 0.5
     extras: tuple[tuple[float, float], ...] = ()
+    rates: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,8 +106,10 @@ class Traffic:
         return {sensor.name: sensor for sensor in self.sensors}
 
     @cached_property
-    def _noise(self) -> Floats:
-        return np.array([kind.noise for kind in self.kinds])
+    def _steps(self) -> Floats:
+        rates = [kind.rates or (0.0,) * len(self.motion.extras) for kind in self.kinds]
+        levels = [[mean for mean, _ in kind.extras] for kind in self.kinds]
+        return np.array([(*kind.noise, *r, *m) for kind, r, m in zip(self.kinds, rates, levels, strict=True)])
 
     @cached_property
     def _lifetime(self) -> Floats:
@@ -137,10 +140,10 @@ class Traffic:
     def move(self, kind: Ints, mean: Floats, seconds: float) -> Moved:
         size, num = len(self.names), len(kind)
         moved, slope = np.empty((num, size)), np.empty((num, size, size))
-        move_formula(self.motion).compiled()(mean, np.full((1, 1), seconds), moved, slope)
         noise = np.empty((num, noise_formula(self.motion).num_y))
-        settings = np.empty((num, 1 + self._noise.shape[1]))
-        settings[:, 0], settings[:, 1:] = seconds, self._noise[kind]
+        settings = np.empty((num, 1 + self._steps.shape[1]))
+        settings[:, 0], settings[:, 1:] = seconds, self._steps[kind]
+        move_formula(self.motion).compiled()(mean, settings, moved, slope)
         noise_formula(self.motion).compiled(jacobian=False)(mean, settings, noise)
         return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self._lifetime[kind]))
 
@@ -149,10 +152,13 @@ class Traffic:
         at = mounted(scan.pose, sensor.mount)
         states = np.concatenate([objects.components.mean, more.mean])
         num, size, d = len(states), len(self.names), len(sensor.names)
-        measure, detect = sensor_formulas(self.motion, type(sensor), len(sensor.settings))  # type: ignore[arg-type]
+        own = np.array([sensor.settings(kind.name) for kind in self.kinds])
+        measure, detect = sensor_formulas(self.motion, type(sensor), own.shape[1])  # type: ignore[arg-type]
+        settings = np.empty((num, 3 + own.shape[1]))
+        settings[:, :3], settings[:, 3:] = at, own[np.concatenate([objects.components.kind, more.kind])]
         predicted, slope, detection = np.empty((num, d)), np.empty((num, d, size)), np.empty((num, 1))
-        measure.compiled()(states, at[None], predicted, slope)
-        detect.compiled(jacobian=False)(states, np.concatenate([at, sensor.settings])[None], detection)
+        measure.compiled()(states, settings, predicted, slope)
+        detect.compiled(jacobian=False)(states, settings, detection)
         noise, values = sensor.covariance(scan), np.ascontiguousarray(scan.values, dtype=np.float64)
         one = len(noise) == 1
         sort = np.zeros(len(values), dtype=np.int64) if one else np.arange(len(values))
@@ -240,9 +246,9 @@ def sensor_formulas(motion: Motion, sensor: type[Sensor], num_settings: int) -> 
     label, size = sensor.__name__.lower(), len(motion.names)
 
     def measure(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        return sensor.measure(motion.body(x, ops), p, ops)
+        return sensor.measure(motion.body(x, ops), p[:3], p[3:], ops)
 
     def detect(x: Scalars, p: Scalars, ops: Any) -> Scalars:
         return (sensor.detect(motion.body(x, ops), p[:3], p[3:], ops),)
 
-    return Formula(f"{label}_measure", measure, size, 3), Formula(f"{label}_detect", detect, size, 3 + num_settings)
+    return Formula(f"{label}_measure", measure, size, 3 + num_settings), Formula(f"{label}_detect", detect, size, 3 + num_settings)

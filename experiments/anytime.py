@@ -8,9 +8,10 @@
     abstain  share of all scenes where none is offered, whatever the iterations: the draws at the end of the run are not
              trusted as far as 40 m (experiments.road_metrics)
 
-100 % of the iterations are the first count whose TPR is within half a point of the last. The paper gives neither its
-tube nor when it abstains. engines=[...] are any with a fixed number of iterations and snapshots; every setting of
-`waybayes` works, ENGINE.knob=... of one engine alone. Engines that are done are not run again (force=true insists).
+100 % are the iterations needed: the first count whose TPR is within half a point of the last; none where the start is
+there already. The paper gives neither its tube nor when it abstains. engines=[...] are any with a fixed number of
+iterations and snapshots; every setting of `waybayes` works, ENGINE.knob=... of one engine alone. Engines that are done
+are not run again (force=true insists).
 """
 
 from __future__ import annotations
@@ -126,18 +127,23 @@ def entries(records: list[dict[str, Any]]) -> tuple[tuple[str, ...], list[tuple[
     for engine in dict.fromkeys(record["engine"] for record in records):
         own = [record for record in records if record["engine"] == engine]
         whole, start = own[-1]["steps"], own[0]["start"]
-        for name, label in (("tpr", "TPR"), ("fpr", "FPR"), ("abstain", "abstain")):
+        abstains = "abstain" if whole is None else "abstain, at the end"
+        for name, label in (("tpr", "TPR"), ("fpr", "FPR"), ("abstain", abstains)):
             cells = [
                 f"{100 * r[name]:.1f}" + (f" ± {100 * r['tpr:se']:.1f}" if name == "tpr" and r.get("tpr:se") else "")
                 for r in own
             ]
-            steps = "–" if whole is None else f"{whole:.0f}"
+            steps = "–" if whole is None else f"{whole:.0f}" if whole else "none: there from the start"
             out.append((engine, start or "–", steps, f"{label} [%]", *cells))
-    return ("engine", "begins at", "iterations, 100 %", "", *(f"{100 * share:.0f} %" for share in shares)), out
+    return ("engine", "begins at", "iterations needed (100 %)", "", *(f"{100 * share:.0f} %" for share in shares)), out
 
 
 def caption(num: int) -> str:
-    return f"{num} scenes; TPR ± standard error, at shares of the iterations; its tube and abstention are ours"
+    return (
+        f"{num} scenes; TPR ± standard error, at shares of the iterations needed: up to the first count within half a "
+        "point of the last TPR. Tubes and abstention are ours; the draws at the end of the run tell who abstains, "
+        "at all shares alike, for along the way only means are kept"
+    )
 
 
 def show(records: list[dict[str, Any]], num: int) -> None:
@@ -191,11 +197,13 @@ def draw(records: list[dict[str, Any]], found: dict[str, Outcomes]) -> Figure:
             right.plot(one.step, one.tpr, color=colour, lw=1.8)
             right.plot(one.step, one.fpr, ":", color=colour, lw=1.4)
             right.plot(whole["steps"], whole["tpr"], "o", color=colour)
-    left.set(xlabel="share of the iterations to the last half point", ylabel="share of all scenes", ylim=(-0.02, 1.02))
+    title = "; ".join(f"{engine} abstains on {one.abstain:.1%} of the scenes" for engine, one in found.items())
+    left.set(xlabel="share of the iterations needed", ylabel="share of all scenes", ylim=(-0.02, 1.02))
     left.set_xticks([0.25, 0.5, 0.75, 1.0])
     left.xaxis.set_major_formatter(PercentFormatter(1.0))
     left.yaxis.set_major_formatter(PercentFormatter(1.0))
-    right.set(xlabel="iterations; the dot: 100 %", xlim=(0, None))
+    right.set(xlabel="iterations; the dot: those needed", xlim=(0, None))
+    figure.suptitle(f"{title}; who abstains is told by the draws at the end of each run", fontsize=9, x=0.01, ha="left")
     for axes, title in ((left, "TPR solid, FPR dotted"), (right, "the same along the iterations")):
         axes.set_title(title, loc="left", fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)

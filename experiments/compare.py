@@ -49,9 +49,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import open_dict
 
+from experiments import store
 from experiments.command import JobFailed, complain, guarded, in_words
 from experiments.compare_cells import Cell, Row, read
-from experiments.run import Job, execute, job_of
+from experiments.run import Job, evidence_of, execute, job_of, remedies
+from experiments.schema import build
 from experiments.signatures import ConfigError
 from experiments.store import ROOT
 
@@ -186,10 +188,31 @@ def gather(tasks: list[Task], say: Callable[[str], None] = print) -> list[Row]:
     return [Row(engine, cells[engine], errors.get(engine), engine in refused) for engine in engines]
 
 
+def refusals(tasks: list[Task]) -> dict[str, Exception]:
+    """{engine: why it refuses the model}, asked of all engines before one works, as far as they tell then
+    (inference.refusal). The first scene speaks for all; engines that are stored on it have run the model already."""
+    first = {task.engine: task.job for task in reversed(tasks)}
+    new = {engine: job for engine, job in first.items() if job.force or not store.is_done(job.folder)}
+    if not new:
+        return {}
+    from inference.refusal import ask
+
+    config, found = next(iter(new.values())).config, dict[str, Exception]()
+    model = build(config["model"], "model")
+    evidence = evidence_of(model, build(config["scenario"], "scenario"))
+    for engine, job in new.items():
+        try:
+            with remedies(model, evidence):
+                ask(build(job.config["engine"], "engine"), model, evidence)
+        except Exception as error:
+            if not in_words(error):
+                continue  # no refusal: let it fail, and say how, where it runs
+            found[engine] = error
+    return found
+
+
 def exact_reference(job: Job) -> list[dict[str, float]] | None:
     """The model's own exact posterior: mean and sd of each scalar in order; None where it has none."""
-    from experiments.schema import build
-
     model = build(job.config["model"], "model")
     if not hasattr(model, "exact"):
         return None
@@ -214,11 +237,17 @@ def main() -> None:
 
 
 def compare(words: list[str]) -> None:
-    """Plan, run, tabulate, store. Raises JobFailed at the end where an engine failed: one that refuses the model only
-    if it was asked for by name or none is left. Where all refuse, that is a mistake of use: exit code 2."""
+    """Plan, run, tabulate, store. Raises JobFailed with exit code 2, before any engine works, where one that was asked
+    for by name refuses the model; with 1 at the end where an engine failed."""
     chosen = plan(words)
     tasks = tasks_of(chosen)
-    rows = gather(tasks)
+    refused = refusals(tasks)
+    for engine, error in refused.items():
+        complain(error, engine)
+    if refused and chosen.named:
+        raise JobFailed(2)
+    rows = gather([task for task in tasks if task.engine not in refused])
+    rows += [Row(engine, [], in_words(error), True) for engine, error in refused.items()]
     conclude(chosen, tasks, rows)
     if all(row.refused for row in rows):
         raise JobFailed(2)

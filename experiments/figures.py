@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from textwrap import fill
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ def marginals(posterior: Posterior, scene: Scene, *, most: int = 8) -> dict[str,
         values = posterior.draws[site][(..., *index)]  # (chain, draw)
         truth = known(scene).get(site)
         _row(left, right, values, posterior.weights, bins=40)
-        left.set_ylabel(site + (str(list(index)) if index else ""))
+        left.set_ylabel(fill(posterior.title(site, index), 20))
         if truth is not None and np.shape(truth) == posterior.draws[site].shape[2:]:
             left.axhline(truth[index], color=ORANGE, ls="--", lw=1)
             right.axvline(truth[index], color=ORANGE, ls="--", lw=1)
@@ -46,12 +47,18 @@ def marginals(posterior: Posterior, scene: Scene, *, most: int = 8) -> dict[str,
             posterior.weights,
             bins=_integer_bins(posterior.model_index),
         )
-        axes[-1][0].set_ylabel("model index")
+        axes[-1][0].set_ylabel(_counted(posterior))
         axes[-1][0].yaxis.get_major_locator().set_params(integer=True)
         axes[-1][1].xaxis.get_major_locator().set_params(integer=True)
     axes[-1][0].set_xlabel("draw")
     axes[-1][1].set_xlabel("value")
     return {"marginals": figure}
+
+
+def _counted(posterior: Posterior) -> str:
+    """What the model index counts, if the labels say."""
+    same = (site for site in posterior.labels if np.array_equal(posterior.draws[site], posterior.model_index))  # type: ignore[arg-type]
+    return next((posterior.title(site) for site in same), "model index")
 
 
 def _integer_bins(values: NDArray[np.int64]) -> list[float]:
@@ -64,6 +71,9 @@ def _row(left: Axes, right: Axes, values: Floats, weights: Floats, bins: int | l
     left.margins(x=0)
     right.hist(values.ravel(), bins=bins, weights=weights.ravel(), density=True, color=BLUE)
     right.set_yticks([])
+    left.ticklabel_format(axis="y", scilimits=(-3, 4), useMathText=True)  # a rate of curvature is 1e-5 / m^2
+    right.ticklabel_format(axis="x", scilimits=(-3, 4), useMathText=True)
+    right.locator_params(axis="x", nbins=5)
 
 
 def line_fit(posterior: Posterior, scene: Scene) -> dict[str, Figure]:

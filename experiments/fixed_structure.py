@@ -19,12 +19,14 @@ import torch
 from numpy.typing import NDArray
 
 from inference.posterior import Posterior, Snapshots
+from inference.refusal import answers_first
 from models.program import InputError, fix
 
 Engine = Callable[..., Posterior]
 Array = NDArray[Any]
 
 
+@answers_first
 def estimate(model: Any, evidence: Any, *, seed: int, structure: Engine, refine: Engine) -> Posterior:
     """Run both. Draws, estimate and snapshots hold the fixed sites too; the snapshots of the structure come first.
 

@@ -11,13 +11,15 @@ AB3DMOT_libs of its repository, units metres, radians and frames; `compensate` l
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from experiments.box_overlap import overlap
-from experiments.kitti_boxes import to_camera, to_world
-from experiments.kitti_matching import TrackBoxes, boxes_of
+from experiments.kitti_boxes import in_view, to_camera, to_world
+from experiments.kitti_matching import TrackBoxes
 from experiments.scenarios.kitti_tracking import KittiSequence, frames_of
 
 Floats = NDArray[np.float64]
@@ -34,6 +36,48 @@ R = np.eye(MEASURED)
 P0 = np.diag([10.0] * MEASURED + [10_000.0] * 3)
 
 
+class Cars(NamedTuple):
+    """N cars that are followed.
+
+    mean        (N, 10), covariance (N, 10, 10)
+    label       (N,) number of the track
+    hits, age   (N,) detections so far, and frames since the last
+    score       (N,) of the last detection
+    """
+
+    mean: Floats
+    covariance: Floats
+    label: Ints
+    hits: Ints
+    age: Ints
+    score: Floats
+
+    def take(self, rows: Ints) -> Cars:
+        """Some of them."""
+        return Cars._make(values[rows] for values in self)
+
+
+def begin(boxes: Floats, score: Floats, first: int) -> Cars:
+    """A car at each box (M, 7), numbered from `first`."""
+    num = len(boxes)
+    mean = np.pad(boxes[:, TO_STATE], ((0, 0), (0, SIZE - MEASURED)))
+    numbers = first + np.arange(num, dtype=np.int64)
+    return Cars(mean, np.tile(P0, (num, 1, 1)), numbers, np.ones(num, np.int64), np.zeros(num, np.int64), score)
+
+
+def step(cars: Cars, boxes: Floats, score: Floats, first: int, *, gate: float, max_age: int) -> Cars:
+    """One frame later: predicted, updated by their detections (M, 7); what is left over begins at number `first`."""
+    mean, covariance = predict(cars.mean, cars.covariance)
+    hits, age, last = cars.hits.copy(), cars.age + 1, cars.score.copy()
+    i, j = assign(overlap(mean[:, TO_BOX], boxes), gate)
+    mean[i], covariance[i] = update(mean[i], covariance[i], boxes[j][:, TO_STATE])
+    hits[i], age[i], last[i] = hits[i] + 1, 0, score[j]
+    known = Cars(mean, covariance, cars.label, hits, age, last).take(np.flatnonzero(age < max_age))
+    free = np.setdiff1d(np.arange(len(boxes)), j)
+    new = begin(boxes[free], score[free], first)
+    return Cars._make(np.concatenate(both) for both in zip(known, new, strict=True))
+
+
 def track(
     sequence: KittiSequence,
     *,
@@ -42,44 +86,37 @@ def track(
     max_age: int = 2,
     least_score: float = -np.inf,
     compensate: bool = True,
+    only_in_view: bool = False,
 ) -> TrackBoxes:
     """Boxes that the baseline reports in a sequence, causally; a track's score is that of its last detection.
 
-    gate         least IoU of a detection with the predicted box
-    min_hits     detections before a track is reported; the first frames of a sequence are exempt
-    max_age      frames without a detection after which a track is dropped; it is reported in fewer
-    least_score  detections below are not looked at
-    compensate   whether to track in the frame of the poses, or in the moving camera's as AB3DMOT did at first"""
+    gate          least IoU of a detection with the predicted box
+    min_hits      detections before a track is reported; the first frames of a sequence are exempt
+    max_age       frames without a detection after which a track is dropped; it is reported in fewer
+    least_score   detections below are not looked at
+    compensate    whether to track in the frame of the poses, or in the moving camera's as AB3DMOT did at first
+    only_in_view  whether to report nothing that is beside the image; AB3DMOT reports it"""
     detections, still = sequence.detections, np.eye(4)[None]
-    pose = sequence.pose if compensate else np.tile(still, (len(sequence.time), 1, 1))
-    position, heading = to_world(detections.camera, pose[frames_of(detections.offset)])
+    if not compensate:
+        sequence = sequence._replace(pose=np.tile(still, (len(sequence.time), 1, 1)))
+    position, heading = to_world(detections.camera, sequence.pose[frames_of(detections.offset)])
     boxes = to_camera(position, heading, detections.size, still)  # axes of the camera, origin of the poses
-    x, P = np.zeros((0, SIZE)), np.zeros((0, SIZE, SIZE))
-    label, hits, age, score = (np.zeros(0, kind) for kind in (np.int64, np.int64, np.int64, np.float64))
-    begun, reported = 0, []
+    cars, begun, reported = begin(boxes[:0], detections.score[:0], 0), 0, []
     for t in range(len(sequence.time)):
         here = np.arange(detections.offset[t], detections.offset[t + 1])
         here = here[detections.score[here] >= least_score]
-        x, P = predict(x, P)
-        age = age + 1
-        i, j = assign(overlap(x[:, TO_BOX], boxes[here]), gate)
-        x[i], P[i] = update(x[i], P[i], boxes[here[j]][:, TO_STATE])
-        hits[i], age[i], score[i] = hits[i] + 1, 0, detections.score[here[j]]
-        new = np.setdiff1d(here, here[j])
-        x = np.concatenate([x, np.pad(boxes[new][:, TO_STATE], ((0, 0), (0, SIZE - MEASURED)))])
-        P = np.concatenate([P, np.tile(P0, (len(new), 1, 1))])
-        label = np.concatenate([label, begun + np.arange(len(new))])
-        hits, age = np.append(hits, np.ones(len(new), np.int64)), np.append(age, np.zeros(len(new), np.int64))
-        score, begun = np.append(score, detections.score[new]), begun + len(new)
-        alive = age < max_age
-        x, P, label, hits, age, score = (values[alive] for values in (x, P, label, hits, age, score))
-        shown = np.flatnonzero((hits >= min_hits) | (t < min_hits))
-        reported.append((label[shown], x[shown][:, TO_BOX], score[shown]))
-    offset = np.cumsum([0] + [len(labels) for labels, _, _ in reported])
-    labels, found, scores = (np.concatenate(parts) for parts in zip(*reported, strict=True))
-    position, heading = to_world(found, np.broadcast_to(still, (len(found), 4, 4)))
-    moved = sequence._replace(pose=pose)
-    return boxes_of(moved, offset, labels, position, heading, found[:, :3], scores)
+        cars = step(cars, boxes[here], detections.score[here], begun, gate=gate, max_age=max_age)
+        begun = max(begun, int(cars.label.max(initial=-1)) + 1)
+        reported.append(cars.take(np.flatnonzero((cars.hits >= min_hits) | (t < min_hits))))
+    frame = np.repeat(np.arange(len(reported)), [len(some.label) for some in reported])
+    label = np.concatenate([some.label for some in reported])
+    score = np.concatenate([some.score for some in reported])
+    box = np.concatenate([some.mean for some in reported])[:, TO_BOX]
+    position, heading = to_world(box, still)
+    box = to_camera(position, heading, box[:, :3], sequence.pose[frame])
+    shown = in_view(box, sequence.projection, sequence.image) | (not only_in_view)
+    offset = np.searchsorted(frame[shown], np.arange(len(reported) + 1)).astype(np.int64)
+    return TrackBoxes(offset, label[shown], box[shown], score[shown])
 
 
 def predict(x: Floats, P: Floats) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""Boxes of vehicles between KITTI's camera frame, the frame of the poses and the image: the one home of the conversions.
+"""Boxes of vehicles between KITTI's camera frame, the frame of the poses and the image: the home of the conversions.
 
 A box of the camera frame is KITTI's row (h, w, l, x, y, z, rot_y): height, width, length [m], the middle of its bottom
 in the rectified camera frame (x right, y down, z forward) [m], and the rotation about y: its length points along
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # (x right, y down, z forward) -> forward, left, up
+AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # right, down, forward to forward, left, up
 NEAR = 0.3  # corners nearer to the plane of the camera, or behind it, are projected from here [m]
 # Corners of a box of length, height and width 1 about the middle of its bottom, (3, 8)
 UNIT = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-1.0, 0.0) for k in (-0.5, 0.5)]).T
@@ -66,23 +66,20 @@ def image_boxes(box: Floats, projection: Floats, image: tuple[int, int]) -> Floa
     projection  (3, 4) of the camera
     image       its width and height [px]
 
-    The smallest rectangle about the eight corners, cut at the border. Zeros where nothing of it is in view."""
+    The smallest rectangle about the eight corners, each side moved to the border where it is beyond: beside the image
+    it has no width, but keeps its height. Corners at the plane of the camera and behind it are taken to be NEAR."""
     h, w, l, x, y, z, turn = box.T  # noqa: E741  (KITTI's letters)
     along, down, across = UNIT[:, None] * np.stack([l, h, w])[..., None]  # (N, 8) each
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     depth = z[:, None] - s * along + c * across
     corners = np.stack([x[:, None] + c * along + s * across, y[:, None] + down, np.maximum(depth, NEAR)], -1)
     seen = corners @ projection[:, :3].T + projection[:, 3]
-    u, v = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
-    right, bottom = image[0] - 1.0, image[1] - 1.0
-    cut = np.stack(
-        [
-            np.clip(u.min(1), 0.0, right),
-            np.clip(v.min(1), 0.0, bottom),
-            np.clip(u.max(1), 0.0, right),
-            np.clip(v.max(1), 0.0, bottom),
-        ],
-        1,
-    )
-    in_view = (cut[:, 2] > cut[:, 0]) & (cut[:, 3] > cut[:, 1]) & (depth.max(1) > NEAR)
-    return np.where(in_view[:, None], cut, 0.0)
+    uv = seen[..., :2] / seen[..., 2:]  # (N, 8, 2)
+    return np.clip(np.concatenate([uv.min(1), uv.max(1)], 1), 0.0, np.tile(image, 2) - 1.0)
+
+
+def in_view(box: Floats, projection: Floats, image: tuple[int, int]) -> NDArray[np.bool_]:
+    """Whether any of a box is in the image, (N,): trackers that report others report what no label can confirm."""
+    covers = image_boxes(box, projection, image)
+    reach = 0.5 * (np.abs(np.sin(box[:, 6])) * box[:, 2] + np.abs(np.cos(box[:, 6])) * box[:, 1])
+    return (covers[:, 2] > covers[:, 0]) & (covers[:, 3] > covers[:, 1]) & (box[:, 5] + reach > NEAR)

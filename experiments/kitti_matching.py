@@ -1,16 +1,17 @@
 """Which reported box is which labelled car, and which boxes count: the rules of the public AB3DMOT evaluation.
 
-Weng, Wang, Held, Kitani (2020), 3D multi-object tracking: a baseline and new evaluation metrics; scripts/KITTI/evaluate.py
-of its repository, class car. In each frame labelled cars and vans are paired with reported boxes so that as many pairs
-as possible reach an IoU of 0.25 and their IoU is largest in sum. Then do not count
+Weng, Wang, Held, Kitani (2020), 3D multi-object tracking: a baseline and new evaluation metrics; class car of
+scripts/KITTI/evaluate.py in its repository. In each frame labelled cars and vans are paired with reported boxes so that
+as many pairs as possible reach an IoU of 0.25 and their IoU is largest in sum. Then do not count
 
     labels   vans, and what is truncated (> 0) or hardly visible (occlusion > 2), whether paired or not; with them goes
              the box they are paired with
     boxes    that are not paired and are 25 px or less high in the image, or more than half inside a region where
              nothing is labelled
 
-The image box is what the reported box covers of the image (experiments.kitti_boxes): that is what the detector's own
-image boxes are too. A box that is not in view has no height, and so does not count unless it is paired.
+The image box is what the reported box covers of the image (experiments.kitti_boxes.image_boxes): that is what the
+detector's own image boxes are too, and where a track coasts there is no other. A box beside the image counts, and is
+false: a tracker has to know what the camera can see (experiments.kitti_boxes.in_view).
 """
 
 from __future__ import annotations
@@ -94,8 +95,8 @@ def boxes_of(
     given = {"position": position, "heading": heading, "size": size, "score": score}
     if np.shape(offset) != (wanted,) or offset[0] != 0 or offset[-1] != num or (np.diff(offset) < 0).any():
         raise InputError(
-            f"offset of sequence {sequence.name} has shape {np.shape(offset)} and ends at {np.ravel(offset)[-1:]}; give "
-            f"{wanted} numbers that grow from 0 to the {num} boxes"
+            f"offset of sequence {sequence.name} has shape {np.shape(offset)} or does not fit the boxes; give {wanted} "
+            f"numbers that grow from 0 to the {num} boxes"
         )
     for name, values in given.items():
         if np.shape(values) != shapes[name]:

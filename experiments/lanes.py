@@ -24,6 +24,7 @@ from experiments.lane_mixture import ReadLanes, mix
 from experiments.lane_posterior import LanePosterior, Lanes, OtherLane, State
 from experiments.readings import Reading, read
 from inference.posterior import Posterior
+from inference.refusal import answers_first
 from models.intersection.course_family import AnyEvidence, Courses, centre_lines, lane_displacements
 from models.intersection.courses import LaneCourses
 from models.intersection.evidence import JunctionEvidence
@@ -40,6 +41,7 @@ NUM_DRAWS = 1000  # of lines, over all readings
 LOST = 1.2  # times the cost of the best reading: courses of another one that cost more got lost
 
 
+@answers_first
 def estimate(
     model: Junction,
     evidence: JunctionEvidence,

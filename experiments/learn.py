@@ -8,6 +8,8 @@ follow; values after commas take turns. A word that begins with `held_out.` coun
 learn=[..] all settings are learnt that the scenes say something about; `delineator` stands for all of that kind.
 num_draws=N and num_rounds=N are those of the method.
 
+Behind the change of a held-out score stands its standard error over the scenes, which are the same for both settings.
+
 The method is inference.empirical_bayes, the settings are those of models.road.hyper. The engine is importance unless
 another one that tells the log evidence is named. What was learnt is stored as an experiment that `waybayes` takes.
 """
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
     from models.capability import Hyper
 
 LEAST = 2  # scenes; one cannot tell settings from chance
+RESAMPLED = 1000  # times, for standard errors of scores
+HEADS = ("held-out score", "configured", "learnt", "change ± s.e.")
 
 
 class Plan(NamedTuple):
@@ -84,15 +88,27 @@ class Row(NamedTuple):
     noise: float
 
 
+class Score(NamedTuple):
+    """A score under both settings, and the standard error of its change: both are judged on the same scenes."""
+
+    before: float
+    after: float
+    error: float
+
+    @property
+    def change(self) -> str:
+        return f"{self.after - self.before:+.3g} ± {self.error:.2g}"
+
+
 class Held(NamedTuple):
     """Held-out scenes under the configured and the learnt settings.
 
     gain    (S,) of the log evidence of each [nats]
-    scores  {score: (before, after)}: medians over the scenes of scores with a unit, means of all others
+    scores  {score: Score}: medians over the scenes of scores with a unit, means of all others
     """
 
     gain: Any
-    scores: dict[str, tuple[float, float]]
+    scores: dict[str, Score]
 
 
 def plan(words: list[str]) -> Plan:
@@ -100,7 +116,7 @@ def plan(words: list[str]) -> Plan:
     numbers, names = {"scenes": 60, "held_out": 30, "num_draws": 200, "num_rounds": 15}, list[str]()
     rest, held = [["engine=importance"]], [list[str]()]
     for word in words:
-        override = OverridesParser.create().parse_override(word)
+        (override,) = OverridesParser.create().parse_overrides([word])
         key = override.key_or_group
         if key in numbers:
             value = override.value()
@@ -109,7 +125,7 @@ def plan(words: list[str]) -> Plan:
                 raise ConfigError(f"{key} is '{value}'; give a whole number, {least} or more")
             numbers[key] = value
         elif key == "learn":
-            value = override.value()
+            value = list(override.sweep_string_iterator()) if override.is_sweep_override() else override.value()
             names = [str(name) for name in (value if isinstance(value, list) else [value])]
             if not names:
                 raise ConfigError("learn is empty; name settings, such as learn=[clutter,delineator], or leave it out")
@@ -212,8 +228,22 @@ def judge(scenes: Sequence[Scene], models: tuple[Any, Any], engine: Any, metrics
         centre = np.nanmedian if split_unit(name)[1] else np.nanmean
         columns = [np.array([each.get(name, np.nan) for each in side], dtype=float) for side in scores]
         if not any(np.isnan(column).all() for column in columns):
-            both[name] = (float(centre(columns[0])), float(centre(columns[1])))
+            both[name] = compared(columns[0], columns[1], centre)
     return Held(np.subtract(evidence[1], evidence[0]), both)
+
+
+def compared(before: Any, after: Any, centre: Callable[..., Any]) -> Score:
+    """Centres of scores (S,) of the same scenes; the error is that of their difference under resampled scenes."""
+    import warnings
+
+    import numpy as np
+
+    index = np.random.default_rng(0).integers(len(before), size=(RESAMPLED, len(before)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a sample may hold only scenes without this score
+        change = centre(after[index], axis=1) - centre(before[index], axis=1)
+    wider = (len(before) / (len(before) - 1)) ** 0.5  # resampled means vary by the variance over S, not S - 1
+    return Score(float(centre(before)), float(centre(after)), wider * float(np.nanstd(change)))
 
 
 def table_of(family: Hyper, learnt: Learnt) -> list[Row]:
@@ -271,7 +301,7 @@ def write(
             *(f'<p class="flag">{escape(flag)}</p>' for flag in learnt.flags),
             table(("setting", "configured", "learnt", "standard error", "Monte Carlo error"), rows),
             f"<h2>Held-out scenes</h2><p>{sentence(held)}</p>",
-            table(("score", "configured", "learnt"), [(name, *both) for name, both in held.scores.items()]),
+            table(HEADS, [(name, score.before, score.after, score.change) for name, score in held.scores.items()]),
             *images.values(),
             f"<h2>To use them</h2><pre>{escape(usage(task))}</pre>",
             details("experiment", changes),
@@ -340,9 +370,10 @@ def show(task: Task) -> None:
         found.add_row(row["setting"], *(number(float(row[key])) for key in ("configured", "learnt", "error")))
     console.print(found)
     outcome = store.read_json(task.folder / "held_out.json")
-    scores = Table("held-out score", "configured", "learnt")
-    for name, both in outcome["scores"].items():
-        scores.add_row(name, *map(number, both))
+    scores = Table(*HEADS)
+    for name, values in outcome["scores"].items():
+        score = Score(*values)
+        scores.add_row(name, number(score.before), number(score.after), score.change)
     console.print(scores)
     for flag in outcome["flags"]:
         console.print(f"flag       {flag}", style="yellow", soft_wrap=True, markup=False, highlight=False)

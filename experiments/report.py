@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 import math
 import re
+import statistics
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
 
 from experiments.command import in_short
@@ -18,11 +20,14 @@ from experiments.signatures import source_of
 
 if TYPE_CHECKING:
     from experiments.run import Result
+    from inference.posterior import Posterior
 
 UNITS = {
     "m": "m", "cm": "cm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
     "sd": "sd", "nats": "nats", "pct": "%", "hz": "Hz",
 }  # fmt: skip
+
+LISTED = 100  # values of a list that are all told
 
 WORDS = {"r_hat": "R-hat", "ess_bulk": "effective draws", "mcse": "standard error of the mean"}
 
@@ -69,7 +74,7 @@ def write_report(
         _scores(result.scores, manifest["config"].get("metrics", [])) if result.scores else unscored,
         "".join(f"<h2>{_words(name)}</h2>{image}" for name, image in images.items()),
         "<h2>Convergence</h2>",
-        _by_name(result.diagnostics),
+        _by_name(_labelled(result.posterior, result.diagnostics)),
         "<h2>Engine</h2>",
         engine_tables(info, result.posterior.log_evidence),
         "<h2>Time</h2>",
@@ -122,6 +127,17 @@ def meanings(scores: Iterable[str], modules: Iterable[str]) -> dict[str, str]:
     text = "\n".join(file.read_text() for module in dict.fromkeys(modules) if (file := source_of(module)))
     lines = {name: re.search(rf"^ +{re.escape(name)}  +(\S.*)$", text, re.MULTILINE) for name in scores}
     return {name: line[1] for name, line in lines.items() if line}
+
+
+def _labelled(posterior: Posterior, diagnostics: dict[str, Any]) -> dict[str, Any]:
+    """Numbers with what people call them before their names, where the labels say."""
+    labels = {
+        f"{site}{list(index)}" if index else site: posterior.title(site, index)
+        for site in posterior.labels
+        if site in posterior.draws
+        for index in np.ndindex(posterior.draws[site].shape[2:])
+    }
+    return {f"{labels[name]}, {name}" if name in labels else name: row for name, row in diagnostics.items()}
 
 
 def _words(name: str) -> str:
@@ -183,8 +199,16 @@ def engine_tables(info: dict[str, Any], log_evidence: float | None) -> str:
         if isinstance(values, dict) and values and name != "flags":
             parts.append(f"<h2>{_words(name)}</h2>{_by_name(values)}")
         elif isinstance(values, list | tuple) and values and name != "flags":
-            parts.append(f"<h2>{_words(name)}</h2><p>{escape(', '.join(map(number, values)))}</p>")
+            parts.append(f"<h2>{_words(name)}</h2><p>{escape(listed(values))}</p>")
     return "".join(parts)
+
+
+def listed(values: Sequence[Any]) -> str:
+    """All of a few values; of many numbers what they are about."""
+    if len(values) <= LISTED or not all(isinstance(value, int | float) for value in values):
+        return ", ".join(map(number, values))
+    told = {"median": statistics.median(values), "least": min(values), "most": max(values)}
+    return f"{len(values)} values: " + ", ".join(f"{name} {number(value)}" for name, value in told.items())
 
 
 def _by_name(values: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from experiments.junction_figures import INK
 from experiments.metrics import known
+from experiments.road_knots import draw_knots, knots_of
 from experiments.road_metrics import (
     BAND,
     LEAST_RANGE,
@@ -54,7 +55,8 @@ def figures(posterior: Posterior, scene: Scene) -> dict[str, Figure]:
 
 def road(posterior: Posterior, scene: Scene) -> Figure:
     """Above: cues with their measured covariances, the estimate with its 90 % band, the truth dashed. Below: how far
-    each is to the left of the estimate, and the tubes. Beyond the calibrated range the estimate is dotted."""
+    each is to the left of the estimate, and the tubes. Beyond the calibrated range the estimate is dotted. A road of
+    pieces has its knots, too, and how many there are."""
     estimate = estimated_road(posterior)
     guess = road_points(estimate)
     left = -offsets_from(drawn_roads(posterior), guess)  # of the drawn roads
@@ -64,10 +66,14 @@ def road(posterior: Posterior, scene: Scene) -> Figure:
     figure = Figure(figsize=(10.5, 6.4), layout="constrained")
     above, across = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     _draw_above(above, scene.data, guess, (low, high), reach)
+    knots = knots_of(posterior)
+    if knots is not None:
+        draw_knots(above, knots, estimate)
     if line is not None:
         above.plot(*line[:, :2].T, ls=(0, (5, 3)), lw=1.1, color=TRUTH, label="true course", zorder=4)
     above.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
-    above.set_title(_headline(scene, reach), loc="left", color=INK, fontsize=11)
+    title = _headline(scene, reach) + (f"\n{knots}" if knots is not None else "")
+    above.set_title(title, loc="left", color=INK, fontsize=11)
     _draw_across(across, guess, (low, high), reach)
     if line is not None:
         error = offsets_from(estimate, at_ranges(line))[0]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -85,7 +85,6 @@ def run(
     What fails once the engine has run takes nothing else with it: it is listed under `failures`."""
     from inference import diagnostics
     from inference.progress import announce
-    from models.program import check
 
     seconds: dict[str, float] = {}
     failures: dict[str, Exception] = {}
@@ -111,9 +110,7 @@ def run(
         scene = scenario()
     say(f"scenario   {scene.name}")
     with stage("prepare"), announce("compiling the model", after=4.0):
-        check_reads(model, scene.data)
-        evidence = model.prepare(scene.data) if hasattr(model, "prepare") else scene.data
-        check(model, evidence)
+        evidence = evidence_of(model, scene)
     say(f"model      {type(model).__name__}")
     if warm_up:
         _infer(engine, model, evidence, engine_seed(seed))
@@ -121,6 +118,8 @@ def run(
     with stage("engine"):
         posterior = _infer(engine, model, evidence, engine_seed(seed))
     seconds["engine, processor"] = time.process_time() - worked
+    if hasattr(model, "labels"):
+        posterior = replace(posterior, labels=model.labels(evidence))
     say(f"posterior  {' x '.join(map(str, posterior.shape))} draws in {seconds['engine']:.2f} s")
     with stage("metrics"):
         scores = {name: float(value) for name, value in collect("metric", metrics, posterior, scene).items()}
@@ -139,22 +138,47 @@ def run(
     return Result(scene, posterior, scores, found.get("summary", {}), found.get("flags", []), drawn, seconds, failures)
 
 
+def evidence_of(model: Any, scene: Scene) -> Any:
+    """What a model makes of a scene. Raises InputError where they do not fit, and for a program that does not run."""
+    from models.program import check
+
+    check_reads(model, scene.data)
+    evidence = model.prepare(scene.data) if hasattr(model, "prepare") else scene.data
+    check(model, evidence)
+    return evidence
+
+
 def _infer(engine: Engine, model: Any, evidence: Any, seed: int) -> Posterior:
-    """The engine's posterior; a refusal of discrete latents names engines that sample them."""
+    """The engine's posterior."""
+    with remedies(model, evidence):
+        return engine(model, evidence, seed=seed)
+
+
+@contextmanager
+def remedies(model: Any, evidence: Any) -> Iterator[None]:
+    """Where an engine refuses a model's latents or densities, name engines that run it."""
+    from models.capability import HasSteps
     from models.program import InputError
 
     try:
-        return engine(model, evidence, seed=seed)
+        yield
     except InputError as error:
-        if "fix()" not in str(error) or not hasattr(model, "moves"):
+        name = type(model).__name__
+        if "fix()" not in str(error):
             raise
-        fit = "engine=rjmcmc or smc_structure"
-        if hasattr(model, "kernel") and model.kernel(evidence).num_edits:  # a greedy search can polish it
-            fit = "engine=rjmcmc, rjmcmc_structure, smc_structure or, its structure fixed, bbvi_structure"
-        raise InputError(
-            f"{type(model).__name__} counts with discrete latents, which this engine does not sample; "
-            f"choose {fit} (from Python: {error})"
-        ) from error
+        if hasattr(model, "moves"):
+            about = f"{name} has an unknown number of parts, and this engine takes a known one"
+            fit = "engine=rjmcmc or smc_structure"
+            if hasattr(model, "kernel") and model.kernel(evidence).num_edits:  # a greedy search can polish it
+                fit = (
+                    "engine=rjmcmc_structure, rjmcmc or smc_structure, which find it, or bbvi_structure, which goes on "
+                    "with the best structure"
+                )
+        elif isinstance(model, HasSteps):
+            about, fit = f"{name} goes on from frame to frame", "engine=particle_filter, or smc for all frames at once"
+        else:
+            raise
+        raise InputError(f"{about}; choose {fit} (from Python: {error})") from error
 
 
 def _name(function: Any) -> str:

@@ -89,6 +89,19 @@ def metrics(
     }
 
 
+def timing(posterior: Posterior, scene: Scene) -> dict[str, float]:
+    """How long a scan takes; nothing where the engine does not tell.
+
+    step_ms      median over the scans
+    step_p99_ms  exceeded by one scan of a hundred
+    """
+    seconds = posterior.info.get("step_seconds", ())
+    if not len(seconds):
+        return {}
+    middle, long = 1e3 * np.quantile(seconds, (0.5, 0.99))
+    return {"step_ms": float(middle), "step_p99_ms": float(long)}
+
+
 def counts(posterior: Posterior, *, scans: int = 10) -> dict[str, NDArray[np.int64]]:
     """Functional: the number of objects after so many scans, evenly over time, {"count[t]": (chain, draw)}. Nothing
     for what is not tracks."""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from experiments.lanes import BAND, Engine, LanePosterior, Lanes
 from experiments.traffic_splines import spline_lanes
 from inference.posterior import Posterior
+from inference.refusal import answers_first
 from models.intersection.free_lines import centre_lines, lane_bands
 from models.intersection.routes import RoutedTracks
 from models.intersection.tracks import Tracks
@@ -44,6 +45,7 @@ class TrafficPosterior(LanePosterior):
     again: Learn | None = None
 
 
+@answers_first
 def estimate(model: TrafficLanes, evidence: TrafficEvidence, *, seed: int, refine: Engine) -> TrafficPosterior:
     """Courses of the lanes that the model found. Raises InputError for a model that finds none."""
     if not isinstance(model, TrafficLanes):

@@ -6,7 +6,7 @@ Every track takes one measurement or is missed, and no two take the same one:
     Z = sum over theta: {1..T} -> {missed, 1..M}, injective where not missed
 
 This table is all that engines for many objects need to know of model and scan. For Bernoulli tracks with existence r,
-detection probability p_D, likelihood g and clutter intensity lambda (Vo and Vo 2013; Reuter, Vo, Vo and Dietmayer 2014),
+detection probability p_D, likelihood g and clutter intensity lambda (Reuter, Vo, Vo and Dietmayer 2014),
 
     ratio_(t, j) = r_t p_D g(z_j | t) / lambda(z_j),   missed_t = 1 - r_t p_D
 

@@ -4,8 +4,8 @@
 
 Rows are passed one by one. What the rows to come need to know of those passed is which columns are taken, and only of
 columns that have rows on both sides: a column gets a bit at its first row and gives it back after its last. With b bits
-in use at most, time is (number of entries) 2^b. The order of the rows decides on b: the next row is the one after which
-the fewest bits stay in use. A chain of any length needs two bits.
+in use at most, time is (number of entries) 2^b. The order of the rows decides on b: the next row is one that needs no
+new bit, or the one after which the fewest stay in use. A chain of any length needs two bits.
 
 Rows and columns play the same part in Z, so that a problem may be solved by its transpose where this needs fewer bits:
 many rows on few columns, or few rows on many columns.
@@ -80,6 +80,8 @@ def arrange(problem, max_bits, plan):  # type: ignore[no-untyped-def]
             score = (new - gone) * (m + 1) + new
             if score < fewest:
                 pick, fewest = q, score
+            if new == 0:
+                break  # needs no bit, now or later
         order[k], order[pick] = order[pick], order[k]
         i, used, after = order[k], live[k], live[k]
         for e in range(offset[i], offset[i + 1]):
@@ -200,7 +202,7 @@ def forward(problem, plan, width, ahead, reach, room, taken, free, spare):  # ty
 
 @nb.njit(error_model="numpy")
 def sample(problem, plan, width, ahead, random, choice):  # type: ignore[no-untyped-def]
-    """Fill choice (n,) with the entry that each row takes, -1 for none, in an exact draw; `ahead` is from `backward`."""
+    """Fill choice (n,) with an exact draw: the entry that each row takes, -1 for none; `ahead` is from `backward`."""
     offset, column, weight, alone, _ = problem
     order, live, _, bit, _ = plan
     s = 0

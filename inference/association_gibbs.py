@@ -1,13 +1,14 @@
 """Gibbs walks over the associations of a group: the reference method, and draws from groups that are too large.
 
-A sweep draws the choice of every row given those of the others (Vo, Vo and Hoang 2017; Reuter et al. 2017),
+A sweep draws the choice of every row given those of the others (Vo, Vo and Hoang 2017; Reuter et al. 2017), in the
+scaled weights of a `Problem`:
 
-    odds of entry (i, j) = ratio_ij / 2^-row_price_i where column j is not held,   odds of none = alone_i / 2^-row_price_i
+    odds of entry (i, j) = weight_ij / unused_j where column j is not held,   odds of none = alone_i
 
-`weigh` counts each distinct association that was met once, by its own weight. Then log Z is a lower bound, and marginals
-are exact once all associations that matter were met; how often the walk meets them does not matter. `walk_draw` picks
-one state out of the walk. Departure from the papers: the walk gives none odds of FLOOR at least, or tracks that cannot
-be missed could never swap measurements; both functions weigh with the true odds.
+`weigh` counts each distinct association that was met once, by its own weight. Then log Z is a lower bound, and
+marginals are exact once all associations that matter were met; how often the walk meets them does not matter.
+`walk_draw` picks one state out of the walk. Departure from the papers: the walk takes alone and unused for FLOOR at
+least, or tracks that cannot be missed could never swap measurements; both functions weigh with the true ones.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from inference.association_random import scramble, uniform
 
-FLOOR = 0.01  # next to odds of one of the best association
+FLOOR = 0.05  # next to the weights of the best association, which are one
 START = np.uint64(1)
 
 
@@ -57,16 +58,25 @@ def log2_weight(cost, alone_cost, choice):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
+def walk_odds(problem, odds):  # type: ignore[no-untyped-def]
+    """Fill the odds (e,) of entries."""
+    for e in range(len(odds)):
+        odds[e] = problem.weight[e] / max(problem.unused[problem.column[e]], FLOOR)
+
+
+@nb.njit(error_model="numpy")
 def weigh(  # type: ignore[no-untyped-def]
-    offset, column, cost, alone_cost, odds, alone, num_sweeps, random, choice, holder, taken, free
+    problem, costs, odds, num_sweeps, random, choice, holder, taken, free
 ):
     """Fill the probabilities that an entry is taken (e,) and a row is alone (n,) from the distinct associations met by
-    a walk that starts at choice, the most probable one; returns the log of their summed weight."""
-    n, size = len(alone), 2
+    a walk that starts at choice, the most probable one; returns the log of their summed weight, costs being -log2 of
+    the weights that count, of entries (e,) and of being alone (n,)."""
+    cost, alone_cost = costs
+    n, size = len(choice), 2
     while size < 2 * (num_sweeps + 1):
         size *= 2
     keys, total, best = np.zeros(size, np.uint64), 0.0, log2_weight(cost, alone_cost, choice)
-    for e in range(len(column)):
+    for e in range(len(odds)):
         taken[e] = 0.0
     for i in range(n):
         free[i] = 0.0
@@ -88,8 +98,8 @@ def weigh(  # type: ignore[no-untyped-def]
                     free[i] += weight
                 else:
                     taken[choice[i]] += weight
-        sweep(offset, column, odds, alone, random, choice, holder)
-    for e in range(len(column)):
+        sweep(problem.offset, problem.column, odds, problem.alone, random, choice, holder)
+    for e in range(len(odds)):
         taken[e] /= total
     for i in range(n):
         free[i] /= total
@@ -97,18 +107,21 @@ def weigh(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
-def walk_draw(offset, column, odds, alone, num_sweeps, random, choice, holder, pick):  # type: ignore[no-untyped-def]
-    """Fill pick (n,) with one of the states of `num_sweeps` sweeps on from choice, chosen by what the floor got wrong."""
+def walk_draw(problem, odds, num_sweeps, random, choice, holder, pick):  # type: ignore[no-untyped-def]
+    """Fill pick (n,) with one of the states of num_sweeps sweeps on from choice, chosen by what the floor got wrong."""
     total = 0.0
-    for i in range(len(alone)):
+    for i in range(len(choice)):
         pick[i] = choice[i]
     for _ in range(num_sweeps):
-        sweep(offset, column, odds, alone, random, choice, holder)
+        sweep(problem.offset, problem.column, odds, problem.alone, random, choice, holder)
         weight = 1.0
-        for i in range(len(alone)):
+        for i in range(len(choice)):
             if choice[i] < 0:
-                weight *= alone[i] / max(alone[i], FLOOR)
+                weight *= problem.alone[i] / max(problem.alone[i], FLOOR)
+        for j in range(len(holder)):
+            if holder[j] < 0:
+                weight *= problem.unused[j] / max(problem.unused[j], FLOOR)
         total += weight
         if uniform(random) * total < weight:
-            for i in range(len(alone)):
+            for i in range(len(choice)):
                 pick[i] = choice[i]

@@ -10,7 +10,7 @@ Its prices, row_price and column_price <= 0, tell how cheap it is:
 
 with equality on the matching, and column_price_j = 0 for columns that it leaves. Weights times 2^prices are therefore
 at most one everywhere and one on the best matching: no sum over matchings can overflow or vanish, whatever the range
-of the weights (`inference.association_kernel`).
+of the weights (`inference.association_groups`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Uniform numbers in machine code from a state of one's own: SplitMix64 (Steele, Lea and Flood 2014).
 
-numba's own generator belongs to the thread, not to the caller. Here the state is an array uint64 (1,), any seed will do."""
+numba's own generator belongs to the thread, not to the caller. Here the state is an array uint64 (1,); any seed will
+do."""
 
 from __future__ import annotations
 

@@ -45,6 +45,7 @@ from inference.gradients import (
 )
 from inference.posterior import Posterior, Snapshots
 from inference.progress import Progress
+from inference.refusal import accept, answers_first
 from inference.snapshots import snapshots
 from inference.transform import Target, whitening
 from models.program import InputError, Model
@@ -145,6 +146,7 @@ def _blame(plan: Plan, q: Gaussian, noise: Array, done: int) -> str:
     return f"the gradient of the ELBO is not finite at step {done}, with a draw of q at {where}"
 
 
+@answers_first
 def run(
     model: Model,
     evidence: Any,
@@ -198,6 +200,7 @@ def run(
         annealed,
     )
     factors = factored(model, evidence)
+    accept()
     found = whitening(model, evidence, factors, transform, init)
     reads = reading(found.target, rao_blackwell)
     parts = blocks(factors.sites, reads, num_samples) if estimator == "overdispersed" else []

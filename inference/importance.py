@@ -26,6 +26,7 @@ from scipy.linalg.lapack import dtrtri
 from inference import weights
 from inference.factors import factored
 from inference.posterior import Posterior
+from inference.refusal import accept, answers_first
 from inference.snapshots import snapshots
 from inference.transform import Target, whitening
 from models.program import InputError, Model
@@ -113,6 +114,7 @@ def learn(u: Array, log_weights: Array) -> Proposal:
     return proposal_of(centre, scale)
 
 
+@answers_first
 def run(
     model: Model,
     evidence: Any,
@@ -137,6 +139,7 @@ def run(
     for name, value, low in (("num_draws", num_draws, least), ("num_rounds", num_rounds, 2)):
         if value < low:
             raise InputError(f"{name} is {value}; importance sampling of {size} numbers needs {low} or more")
+    accept()
     target, start, evaluations, flags = whitening(model, evidence, factors, transform, init)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     proposals = [proposal_of(start, np.eye(size))]

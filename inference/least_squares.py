@@ -28,6 +28,7 @@ from torch.func import jacfwd, jacrev
 
 from inference import squares
 from inference.posterior import Posterior, Snapshots
+from inference.refusal import accept, answers_first
 from models.capability import HasSquares
 from models.program import InputError, Latents, Model, log_joint, terms
 from models.whitening import Bound, bind
@@ -101,6 +102,7 @@ def step(bound: Bound, state: State, *, inflation: float = 1.0) -> tuple[State, 
     return linearise(bound, x, damping=damping, inflation=inflation), True
 
 
+@answers_first
 def run(
     model: Model,
     evidence: Any,
@@ -143,6 +145,7 @@ def run(
         raise InputError(f"learn needs a model with squares(), but {type(model).__name__} has none; leave it empty")
     bound = bind(model, evidence)
     bound.check_residuals()
+    accept()
     path = [(0, 0.0, _first(bound, init))]
     tried = 0
     for inflation in continuation:

@@ -20,6 +20,7 @@ from torch import Tensor
 from inference.factors import factored
 from inference.posterior import Posterior
 from inference.progress import Progress
+from inference.refusal import accept, answers_first
 from inference.snapshots import snapshots
 from inference.transform import Target, whitening
 from models.program import InputError, Model, quiet_doubles
@@ -42,6 +43,7 @@ class Potential:
         return -(float(height[0]) + torch.from_numpy(slope[0]) @ change)
 
 
+@answers_first
 def run(
     model: Model,
     evidence: Any,
@@ -69,6 +71,7 @@ def run(
     began = time.perf_counter()
     _check(num_chains, num_draws, warmup, spread, target_acceptance, max_tree_depth)
     factors = factored(model, evidence)
+    accept()
     target, start, evaluations, flags = whitening(model, evidence, factors, transform, init)
     potential, chains, times = Potential(target), [], [time.perf_counter() - began]
     divergent, lengths = 0, []

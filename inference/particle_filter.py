@@ -37,6 +37,7 @@ from inference import weights
 from inference.guide import fit, look_ahead
 from inference.posterior import Posterior, Snapshots
 from inference.progress import Progress
+from inference.refusal import accept, answers_first
 from models.capability import HasGaussianSteps, HasSteps, State
 from models.program import (
     InputError,
@@ -136,6 +137,7 @@ def guided_step(
     return Cloud(step.state(z), found, parent, height, log_factor, _effective(parent, cloud, num))
 
 
+@answers_first
 def run(
     model: Any,
     evidence: Sequence[Any],
@@ -161,6 +163,7 @@ def run(
     began = time.perf_counter()
     guided = _is_guided(model, proposal)
     _check(evidence, num_particles, ess, defence)
+    accept()
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     clouds, times = list[Cloud](), list[float]()
     families = np.arange(num_particles)

@@ -41,6 +41,7 @@ class Posterior:
     estimate      {site: (*event)} the best single state (highest log joint seen)
     info          evaluations, seconds, acceptance by move, flags: plain numbers, strings, lists
     snapshots     along the iterations, None where the engine keeps none
+    labels        {site: what people call each of its numbers, with the unit}, where the model says so
     """
 
     draws: dict[str, Array]
@@ -50,12 +51,19 @@ class Posterior:
     estimate: dict[str, Array] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
     snapshots: Snapshots | None = None
+    labels: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def shape(self) -> tuple[int, int]:
         """(chains, draws)."""
         first = next(iter(self.draws.values()))
         return first.shape[0], first.shape[1]
+
+    def title(self, site: str, index: tuple[int, ...] = ()) -> str:
+        """What people call a number of a site; 'site[i]' where nobody says."""
+        if site not in self.labels:
+            return site + (str(list(index)) if index else "")
+        return self.labels[site][int(np.ravel_multi_index(index, self.draws[site].shape[2:])) if index else 0]
 
     @property
     def weights(self) -> Array:
@@ -141,7 +149,7 @@ class Posterior:
             s = self.snapshots
             arrays |= {"snapshots.step": s.step, "snapshots.seconds": s.seconds, "snapshots.log_joint": s.log_joint}
             arrays |= {f"snapshots/{k}": v for k, v in s.states.items()}
-        return arrays, {"log_evidence": self.log_evidence, "info": self.info}
+        return arrays, {"log_evidence": self.log_evidence, "info": self.info, "labels": self.labels}
 
     @staticmethod
     def load(folder: Path) -> Posterior:
@@ -170,6 +178,7 @@ def fields_of(arrays: dict[str, Array], rest: dict[str, Any]) -> dict[str, Any]:
         "estimate": part_of(arrays, "estimate/"),
         "info": rest["info"],
         "snapshots": snapshots,
+        "labels": {site: tuple(names) for site, names in rest.get("labels", {}).items()},
     }
 
 

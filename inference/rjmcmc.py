@@ -21,6 +21,7 @@ from inference import weights
 from inference.acceptance import RULES, log_acceptance
 from inference.posterior import Posterior, Snapshots
 from inference.progress import Progress, announce
+from inference.refusal import accept, answers_first
 from models.capability import HasMoves, Move
 from models.program import InputError, Latents, quiet_doubles, simulate, terms, total
 
@@ -173,6 +174,7 @@ def first_states(model: Any, evidence: Any, init: Latents | None, num_chains: in
     return {n: v.expand((num_chains, *v.shape)).clone() for n, v in tensors.items()}
 
 
+@answers_first
 def run(
     model: HasMoves,
     evidence: Any,
@@ -244,14 +246,16 @@ def run(
             from inference.polish import compiled_climb
 
             kernel = model.kernel(evidence)
+            if polish and kernel.refit is None:
+                raise InputError("polish=true needs a kernel with edits and a refit, but this model's has none")
+            accept()
             z = kernel.pack({n: v.numpy() for n, v in latents.items()})
             compiled = CompiledChains(kernel, z, RULES[acceptance], thin, keep_from, seeds, num_workers)
             chains, climb = compiled, compiled.polish
-            if polish and kernel.refit is None:
-                raise InputError("polish=true needs a kernel with edits and a refit, but this model's has none")
             if polish:
                 compiled_climb()  # now, so that it is not timed with the chains
     else:
+        accept()
         chains = BatchedChains(model, evidence, latents, RULES[acceptance], thin, keep_from, shared)
     _check_start(chains)
     rng = np.random.default_rng(shared.spawn(1)[0])

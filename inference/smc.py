@@ -27,6 +27,7 @@ from inference.factors import factored
 from inference.population import Movers, Population, Walkers
 from inference.posterior import Posterior
 from inference.progress import Progress, announce
+from inference.refusal import accept, answers_first
 from inference.snapshots import snapshots
 from inference.transform import whitening
 from models.program import InputError
@@ -35,6 +36,7 @@ Array = NDArray[Any]
 FEW = 20.0  # families below which a population has forgotten its beginnings
 
 
+@answers_first
 def run(
     model: Any,
     evidence: Any,
@@ -71,6 +73,7 @@ def run(
     if jumps:
         if transform != "prior":
             raise InputError(f"transform={transform} is for numbers that walk; use transform=prior or moves=walk")
+        accept()
         with announce(f"compiling the sampler for {type(model).__name__}"):
             population, evaluations, flags = Movers(model, evidence, num_particles, num_moves, first), 0, list[str]()
     else:
@@ -137,6 +140,7 @@ def _walkers(
     size = factors.depends.shape[1]
     if num_particles < 2 * size:
         raise InputError(f"num_particles is {num_particles}; a cloud of {size} numbers needs {2 * size} or more")
+    accept()
     target, _, evaluations, flags = whitening(model, evidence, factors, transform, init)
 
     def density(u: Array) -> Array:

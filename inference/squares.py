@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from inference.arrow import Factor, arrow, colour, factorise, half_log_determinant, solve, squared_norm, variances
 from inference.posterior import Posterior, Snapshots
+from inference.refusal import accept
 from models.capability import HasSquares, Squares
 from models.program import InputError
 
@@ -30,6 +31,7 @@ Array = NDArray[np.float64]
 TRUST = 4.0  # numbers that the configured scale counts for
 WIDEST = 20.0  # learnt scales stay within a fifth and this multiple of the configured ones
 STALL = 1.0  # [nats] that a posterior would show
+NEAR = 0.1  # [nats] left that are as good as none, where steps run out: models with kinks stall so
 LEARNT_AFTER = (2, 4, 7, 11, 16, 22)  # steps: the inverse that learning needs costs as much as several of them
 
 
@@ -85,7 +87,7 @@ def minimise(
     `began` on, a reading of time.perf_counter.
 
     Where steps are refused again and again, damping grows until none promises much: that is converged only if an
-    undamped step does not promise more than STALL either."""
+    undamped step does not promise more than STALL either. Where steps run out, it must not promise more than NEAR."""
     if charted := [name for name in learn if name in squares.charts]:
         raise InputError(
             f"learn names {', '.join(charted)}, whose numbers have no prior scale of their own; leave it out"
@@ -118,7 +120,8 @@ def minimise(
             state, scale = relearn(squares, state, scale, variances(factor), learn)
         visited.append((time.perf_counter() - began, state.misfit, squares.loc + scale * state.x))
     factor = factorise(shape, state.hessian, scale)
-    converged = stopped and 0.5 * squared_norm(factor, state.gradient) <= max(tolerance, STALL)
+    left = 0.5 * squared_norm(factor, state.gradient)
+    converged = left <= max(tolerance, STALL if stopped else NEAR)
     return Path(state, scale, visited, converged, factor)
 
 
@@ -161,6 +164,7 @@ def run(
     """Minimise, then draw from the Laplace posterior, as inference.least_squares.run does and says."""
     began = time.perf_counter()
     squares = model.squares(evidence)
+    accept()
     if init is None and hasattr(model, "start"):
         init = model.start(evidence)
     if init is not None and squares.sites.keys() - init.keys():

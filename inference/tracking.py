@@ -1,9 +1,9 @@
 """Filters of many objects over the scans of many sensors, each in its time: what all of them share.
 
 A filter is a step from one belief to the next. Scans come in the order of their arrival, which need not be that of
-their times: one that comes late, but not by more than `patience` seconds, is put where it belongs, and the steps of the scans
-after it are done again from the belief of then. So the belief is what it would have been had all come in time. A scan
-that comes later still is left out, and told of.
+their times: one that comes late, but not by more than `patience` seconds, is put where it belongs, and the steps of the
+scans after it are done again from the belief of then. So the belief is what it would have been had all come in time. A
+scan that comes later still is left out, and told of.
 """
 
 from __future__ import annotations
@@ -73,11 +73,11 @@ def track(
     cannot use."""
     if not len(scans):
         raise InputError("a filter needs at least one scan, but got none; wait for the first")
+    scans = model.check(scans)
     past, told, seconds, now = list[Past](), list[Objects](), list[float](), list[float]()
     log_factor, loopy, left_out, late, too_late = 0.0, 0, 0.0, 0, 0
     with Progress("tracking", len(scans), progress) as bar, announce("compiling the filter", after=4.0):
         for number, scan in enumerate(scans):
-            model.check(scan)
             begin = time.perf_counter()
             if belief.time is not None and scan.time < belief.time - patience:
                 too_late += 1

@@ -125,7 +125,7 @@ def kitti_tracking(sequence: str = "0006", data_root: str = DATA_ROOT) -> Scene:
     pose = pose_of(_numbers(pose_file, _rows(pose_file, POSE)))
     data = KittiSequence(
         name=sequence,
-        time=STEP * np.arange(len(pose)),
+        time=STEP * np.arange(len(pose), dtype=np.float64),
         pose=pose,
         projection=_projection(_file(data_root, "calib", ".txt", sequence)),
         image=OTHER_IMAGES.get(sequence, IMAGE),
@@ -237,11 +237,12 @@ def _is_number(word: str) -> bool:
 
 
 def _offsets(path: Path, frame: Floats, num_frames: int) -> Ints:
-    """Where each frame's rows begin, (T + 1,). Raises InputError for frames out of order and for such without a pose."""
+    """Where each frame's rows begin, (T + 1,). Raises InputError for frames out of order or without a pose."""
     wrong = np.flatnonzero((frame != np.round(frame)) | (frame < 0) | (frame >= num_frames))
     if len(wrong):
         raise InputError(
-            f"{path}, line {wrong[0] + 1}: frame is {frame[wrong[0]]:g}; there are poses of frames 0 to {num_frames - 1}"
+            f"{path}, line {wrong[0] + 1}: frame is {frame[wrong[0]]:g}; there are poses of frames 0 to "
+            f"{num_frames - 1}"
         )
     back = np.flatnonzero(np.diff(frame) < 0)
     if len(back):

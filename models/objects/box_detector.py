@@ -1,87 +1,82 @@
-"""A detector of 3-D boxes of vehicles that scores them, such as PointRCNN."""
+"""A detector of boxes that also says how much it likes each: PointRCNN and its like."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.objects.motion import Body
-from models.objects.scans import Scan
-from models.objects.sensors import Placed, Scalars, Sensor, logistic
+from models.objects.sensors import Placed, RangeBearing, Scalars
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Look:
-    """How a kind looks to the detector: score at range r is score - fall max(r - near, 0); detection probability."""
-
-    fall: float = 0.0
-    near: float = 10.0
-    detection: float = 0.97
-    far: float = 70.0
+FALL, NEAR = 0.2, 12.0  # scores of the same object fall by so much to the metre, from here on [m]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoxDetector(Sensor):
-    looks: tuple[tuple[str, Look], ...] = ()
-    clutter_density: float = 2.7e-4  # per m^2
-    clutter_score: tuple[float, float] = (0.7, 1.3)
-    clutter_size: tuple[tuple[float, float], ...] = ((1.55, 0.15), (1.63, 0.07), (3.97, 0.35))
-    clutter_z: tuple[float, float] = (-1.7, 0.5)
-    score_std: float = 1.0
-    stds: tuple[float, ...] = (0.12, 0.07, 0.05, 0.08, 0.1, 0.1, 0.3)
-    names: ClassVar[tuple[str, ...]] = ("x", "y", "heading", "z", "height", "width", "length", "score")
+class BoxDetector(RangeBearing):
+    """Range [m] and bearing [rad] of the middle of a box, the axis it lies along (front and back are not told apart
+    [rad]), height of its bottom z, height, width, length [m], and a score, any number that grows with confidence.
+
+    noise_std       (8,) at score 0; across the line of sight in metres, not radians
+    sharpening      noise falls with the score s by exp(-sharpening s), but for that of the score itself
+    clutter_density false alarms are uniform in the view with so many to the square metre; their z, sizes and scores
+                    normal: `clutter_shape` (5, 2), mean and standard deviation
+
+    The score is an entry of the state: how well an object is liked stays much the same from scan to scan, so that many
+    detections of one object do not count as so many independent opinions."""
+
+    sharpening: float = 0.15
+    clutter_density: float = 2.7e-4
+    clutter_shape: tuple[tuple[float, float], ...] = ((0.0, 1.0),) * 5
+    soft: float = 4.0  # how softly the view ends at its farthest [m]
+    half_width: float = 1.2  # of an object: one that is partly in the image may be seen [m]
+
+    names: ClassVar[tuple[str, ...]] = ("range", "bearing", "axis", "z", "height", "width", "length", "score")
+    reads: ClassVar[tuple[str, ...]] = ("heading", "z", "height", "width", "length", "score")
 
     @property
-    def period(self) -> Floats:
-        return np.where([name == "heading" for name in self.names], math.pi, math.inf)
+    def view_settings(self) -> tuple[float, ...]:
+        return (self.angle / 2, self.reach[1], self.soft, self.half_width)
 
-    def settings(self, kind: str) -> tuple[float, ...]:
-        look = dict(self.looks)[kind]
-        return (look.detection, self.angle / 2, look.far, look.fall, look.near)
-
-    @staticmethod
-    def measure(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Scalars:
-        dx, dy = body.x - at[0], body.y - at[1]
-        distance = ops.sqrt(dx * dx + dy * dy + 1e-9)
-        score = body.score - settings[3] * ops.fmax(distance - settings[4], 0.0)
-        return (body.x, body.y, body.heading, body.z, body.height, body.width, body.length, score)
+    @property
+    def noise_settings(self) -> tuple[float, ...]:
+        return (*self.noise_std, self.sharpening)
 
     @staticmethod
-    def detect(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Any:
-        detection, half, far = settings[:3]
-        dx, dy = body.x - at[0], body.y - at[1]
-        along, across = ops.cos(at[2]) * dx + ops.sin(at[2]) * dy, ops.cos(at[2]) * dy - ops.sin(at[2]) * dx
-        distance, bearing = ops.sqrt(dx * dx + dy * dy + 1e-12), ops.atan2(across, along + 1e-12)
-        half_width = 1.2 / distance  # of the object as an angle: one that is partly in the image may be seen
-        inside = ops.fmin(ops.fmax((half + half_width - ops.fabs(bearing)) / (2 * half_width), 0.0), 1.0)
-        return detection * ops.fmin(1.5 * inside, 1.0) * logistic((far - distance) / 4.0, ops)
+    def measure(body: Body, at: Scalars, ops: Any) -> Scalars:
+        place = RangeBearing.measure(body, at, ops)
+        score = body.score - FALL * ops.fmax(place[0] - NEAR, 0.0)
+        return (*place, body.heading, body.z, body.height, body.width, body.length, score)
 
-    def covariance(self, scan: Scan) -> Floats:
-        values, score = scan.values, scan.values[:, 7]
-        k = np.exp(np.interp(score, [-1, 1, 4, 7, 10], np.log([3.0, 2.2, 1.5, 1.0, 0.6])))
-        R = np.zeros((len(values), 8, 8))
-        angle = np.arctan2(values[:, 1] - scan.pose[1], values[:, 0] - scan.pose[0])
-        cos, sin = np.cos(angle), np.sin(angle)
-        a, b = (self.stds[0] * k) ** 2, (self.stds[1] * k) ** 2
-        R[:, 0, 0], R[:, 1, 1] = cos**2 * a + sin**2 * b, sin**2 * a + cos**2 * b
-        R[:, 0, 1] = R[:, 1, 0] = cos * sin * (a - b)
-        for i, std in enumerate(self.stds[2:], start=2):
-            R[:, i, i] = (std * k) ** 2
-        R[:, 7, 7] = self.score_std**2
-        return R
+    @staticmethod
+    def spread(z: Scalars, settings: Scalars, ops: Any) -> Scalars:
+        along, across, *rest, score, sharpening = settings
+        factor = ops.exp(-sharpening * z[7])
+        return (along * factor, across * factor / ops.fmax(z[0], 1.0), *(std * factor for std in rest), score)
+
+    @staticmethod
+    def view(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Any:
+        half, far, soft, half_width = settings
+        distance, bearing = RangeBearing.measure(body, at, ops)
+        bearing = ops.atan2(ops.sin(bearing), ops.cos(bearing))
+        wide = half_width / distance
+        inside = ops.fmin(ops.fmax((half + wide - ops.fabs(bearing)) / (2 * wide), 0.0), 1.0)
+        return ops.fmin(1.5 * inside, 1.0) * (0.5 + 0.5 * ops.tanh(0.5 * (far - distance) / soft))
 
     def place(self, values: Floats, noise: Floats, at: Floats) -> Placed:
-        return Placed(values[:, :2], noise[:, :2, :2], values[:, 2:3], 1.0)
+        found = super().place(values, noise, at)
+        return found._replace(heading=values[:, 2:3], heading_std=np.sqrt(noise[:, 2, 2]))
+
+    @property
+    def span(self) -> Floats:
+        loc, std = np.array(self.clutter_shape).T
+        return np.vstack([super().span, (0.0, math.pi), np.stack([loc - 3 * std, loc + 3 * std], 1)])
 
     def clutter_intensity(self, values: Floats) -> Floats:
-        loc, std = zip(self.clutter_z, *self.clutter_size, self.clutter_score, strict=True)
-        z = (values[:, 3:] - np.array(loc)) / np.array(std)
-        log = -0.5 * np.square(z).sum(1) - np.log(np.array(std) * math.sqrt(2 * math.pi)).sum()
-        return self.clutter_density / math.pi * np.exp(log)
+        loc, std = np.array(self.clutter_shape).T
+        log = -0.5 * np.square((values[..., 3:] - loc) / std).sum(-1) - np.log(std * math.sqrt(2 * math.pi)).sum()
+        return self.clutter_density * values[..., 0] / math.pi * np.exp(log)

@@ -2,8 +2,12 @@
 
     x' = f(x, dt) + L(x, dt) e,   e ~ N(0, I)
 
-The first entries of a state are those of the motion; `extras` follow, each a random walk: what an object is like (its
-box) or where it points. CTRA is the motion of vehicles in [K15], section V-A.
+The first entries of a state are those of the motion; `extras` follow: what an object is like (its box) or where it
+points, each a random walk, or drawn back to a level m at a rate r:
+
+    e' = m + (e - m) exp(-r dt) + N(0, q^2 (1 - exp(-2 r dt)) / 2 r)
+
+CTRA is the motion of vehicles in [K15], section V-A.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ Scalars = Sequence[Any]
 ANGLES = {
     "heading": 2 * math.pi,
     "bearing": 2 * math.pi,
+    "axis": math.pi,
 }  # entries of states and measurements that are angles, and their period
 
 
@@ -199,7 +204,7 @@ def num_settings(motion: Motion) -> int:
 
 @lru_cache
 def noise_formula(motion: Motion) -> Formula:
-    """(x; step) -> L (n, m), row after row; an extra of rate r and noise q has the variance q^2 (1 - exp(-2 r dt)) / 2 r."""
+    """(x; step) -> L (n, m), row after row."""
     size, num = len(motion.names), len(motion.noises)
     own = size - len(motion.extras)
 

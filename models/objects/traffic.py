@@ -12,26 +12,29 @@ with the probability that it is an object rather than a false alarm, in its own 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.formula import Formula
 from models.multi_object import Bernoullis, Components, Moved, View, no_components, no_objects
-from models.objects.motion import ANGLES, ConstantTurn, Motion, Scalars, move_formula, noise_formula
-from models.objects.scans import Scan
-from models.objects.sensors import Sensor, mounted
+from models.objects.motion import ANGLES, ConstantTurn, Motion, move_formula, noise_formula
+from models.objects.perception import together
+from models.objects.scans import Recording, Scan, check_scan
+from models.objects.scene import ScanFrame, State, first, frames_of, in_order, see, step
+from models.objects.sensors import Sensor, hidden_formula, mounted, sensor_formulas
 from models.program import InputError
+from models.unroll import unroll
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 FLAT = 100.0  # a prior this many times wider than a measurement is taken for uniform: it adds 1e-4 of its information
-HEADINGS = 4  # about which a heading that nobody measured is normal, each with a quarter of the circle
+HEADINGS, HEADING_STD = 4, 0.5  # about which a heading that nobody measured is normal, for a uniform one [rad]
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,10 @@ class Kind:
     speed         mean and standard deviation [m/s] when first seen
     yaw_rate_std, acceleration_std  when first seen [rad/s], [m/s^2]
     extras        (mean, standard deviation) of the motion's extras when first seen
+    rates         at which extras go back to their mean [1/s]: with noise q and rate r their standard deviation tends to
+                  q / sqrt(2 r); none for random walks
+    visibility    factor to every sensor's probability to detect it
+    radius        of the disc that hides what is behind it [m]
     """
 
     name: str = "object"
@@ -55,6 +62,15 @@ class Kind:
     acceleration_std: float = 0.5
     extras: tuple[tuple[float, float], ...] = ()
     rates: tuple[float, ...] = ()
+    visibility: float = 1.0
+    radius: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "extras", tuple(tuple(pair) for pair in self.extras))  # configs have lists
+        object.__setattr__(self, "rates", tuple(self.rates) or (0.0,) * len(self.extras))
+        for what in ("share", "lifetime", "radius"):
+            if not 0.0 < getattr(self, what) < math.inf:
+                raise InputError(f"kind {self.name}: {what} is {getattr(self, what)}; give a positive number")
 
 
 @dataclass(frozen=True)
@@ -77,6 +93,8 @@ class Traffic:
     kinds: tuple[Kind, ...] = (Kind(),)
     unseen_density: float = 1e-4  # [1/m^2]
     places: tuple[Place, ...] = ()
+    region: tuple[float, float, float, float] = (-100.0, -100.0, 100.0, 100.0)  # x, y to x, y [m]: of the program
+    slots: int = 6  # for objects of the program
 
     def __post_init__(self) -> None:
         names = [sensor.name for sensor in self.sensors]
@@ -87,6 +105,20 @@ class Traffic:
                 raise InputError(
                     f"kind {kind.name} has {len(kind.noise)} noises and {len(kind.extras)} extras; "
                     f"give a number for each of {self.motion.noises} and a pair for each of {self.motion.extras}"
+                )
+        if abs(sum(kind.share for kind in self.kinds) - 1.0) > 1e-9:
+            raise InputError(f"the shares of kinds are {[kind.share for kind in self.kinds]}; make them sum to one")
+        body = self.motion.body((0.0,) * len(self.names), math)
+        for sensor in self.sensors:
+            if missing := [name for name in sensor.reads if getattr(body, name) is None]:
+                raise InputError(
+                    f"sensor {sensor.name} measures {missing[0]}, which the state {self.names} does not have; "
+                    "add it to the motion's extras, or choose another sensor"
+                )
+            if sensor.confusion is not None and len(sensor.confusion) != 1 + len(self.kinds):
+                raise InputError(
+                    f"sensor {sensor.name} has a confusion of {len(sensor.confusion)} rows; give one for each of "
+                    f"{self.kind_names} and one for false alarms"
                 )
 
     @property
@@ -106,10 +138,19 @@ class Traffic:
         return {sensor.name: sensor for sensor in self.sensors}
 
     @cached_property
-    def _steps(self) -> Floats:
-        rates = [kind.rates or (0.0,) * len(self.motion.extras) for kind in self.kinds]
+    def step_settings(self) -> Floats:
+        """(C, .) what a step depends on but its time, of each kind: noises, rates and levels of the extras."""
         levels = [[mean for mean, _ in kind.extras] for kind in self.kinds]
-        return np.array([(*kind.noise, *r, *m) for kind, r, m in zip(self.kinds, rates, levels, strict=True)])
+        return np.array([(*k.noise, *k.rates, *m) for k, m in zip(self.kinds, levels, strict=True)])
+
+    @cached_property
+    def visibility(self) -> Floats:
+        """(C,) of the kinds."""
+        return np.array([kind.visibility for kind in self.kinds])
+
+    @cached_property
+    def _radius(self) -> Floats:
+        return np.array([kind.radius for kind in self.kinds])
 
     @cached_property
     def _lifetime(self) -> Floats:
@@ -124,25 +165,58 @@ class Traffic:
             )
         return self._sensors[scan.sensor]
 
-    def check(self, scan: Scan) -> None:
-        """Raise InputError for a scan that cannot be used."""
-        sensor, values = self.sensor(scan), np.asarray(scan.values)
-        if values.ndim != 2 or values.shape[1] != len(sensor.names) or not np.isfinite(values).all():
-            raise InputError(
-                f"the scan of sensor '{scan.sensor}' at {scan.time} s has values of shape {values.shape}, finite: "
-                f"{bool(np.isfinite(values).all())}; give finite numbers (M, {len(sensor.names)}): {sensor.names}"
-            )
-        if not math.isfinite(scan.time) or not np.isfinite(scan.pose).all():
-            raise InputError(
-                f"a scan of sensor '{scan.sensor}' has time {scan.time} and pose {scan.pose}; give numbers"
-            )
+    @property
+    def unseen_numbers(self) -> Floats:
+        """(1, C) objects expected in the region, by kind."""
+        x0, y0, x1, y1 = self.region
+        return self.unseen_density * (x1 - x0) * (y1 - y0) * np.array([[kind.share for kind in self.kinds]])
+
+    @property
+    def arrival_rates(self) -> Floats:
+        """(O, C) newcomers [1/s], from anywhere in the region and from each place, by kind."""
+        share = np.array([kind.share for kind in self.kinds])
+        return np.vstack([self.unseen_numbers / self._lifetime, *(place.rate * share for place in self.places)])
+
+    def newcomer(self, kind: Kind) -> tuple[Floats, Floats]:
+        """Mean and standard deviation (n,) of a newcomer's state; those of position and heading are zero."""
+        return _state_prior(self.motion, kind)
+
+    def formulas(self, sensor: Sensor) -> tuple[Formula, Formula]:
+        """h and p_D of a sensor: see sensor_formulas."""
+        return sensor_formulas(self.motion, type(sensor), len(sensor.settings))  # type: ignore[arg-type]
+
+    def prepare(self, recording: Recording) -> tuple[ScanFrame, ...]:
+        """The frames of a recording, in its order. Raises InputError for a scan that cannot be used (`check`)."""
+        return frames_of(self, self.check(recording.scans))
+
+    def check(self, scans: Sequence[Scan | ScanFrame]) -> tuple[Scan, ...]:
+        """The scans in the order given, those of frames for frames. Raises InputError for a sensor that the model has
+        not, and for numbers that no sensor gives (models.objects.scans)."""
+        found = list[Scan]()
+        for scan in scans:
+            scan = scan.scan if isinstance(scan, ScanFrame) else scan
+            sensor = self.sensor(scan)
+            found.append(check_scan(scan, sensor.names, len(self.kinds), probabilities=sensor.scores_are_probabilities))
+        return tuple(found)
+
+    def __call__(self, frames: Sequence[ScanFrame]) -> None:
+        unroll(self)(in_order(frames))
+
+    def initial(self, frame: ScanFrame) -> State:
+        return first(self, frame)
+
+    def transition(self, state: State, frame: ScanFrame) -> State:
+        return step(self, state, frame)
+
+    def observe(self, state: State, frame: ScanFrame) -> None:
+        see(self, state, frame)
 
     def move(self, kind: Ints, mean: Floats, seconds: float) -> Moved:
         size, num = len(self.names), len(kind)
         moved, slope = np.empty((num, size)), np.empty((num, size, size))
         noise = np.empty((num, noise_formula(self.motion).num_y))
-        settings = np.empty((num, 1 + self._steps.shape[1]))
-        settings[:, 0], settings[:, 1:] = seconds, self._steps[kind]
+        settings = np.empty((num, 1 + self.step_settings.shape[1]))
+        settings[:, 0], settings[:, 1:] = seconds, self.step_settings[kind]
         move_formula(self.motion).compiled()(mean, settings, moved, slope)
         noise_formula(self.motion).compiled(jacobian=False)(mean, settings, noise)
         return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self._lifetime[kind]))
@@ -152,30 +226,53 @@ class Traffic:
         at = mounted(scan.pose, sensor.mount)
         states = np.concatenate([objects.components.mean, more.mean])
         num, size, d = len(states), len(self.names), len(sensor.names)
-        own = np.array([sensor.settings(kind.name) for kind in self.kinds])
-        measure, detect = sensor_formulas(self.motion, type(sensor), own.shape[1])  # type: ignore[arg-type]
-        settings = np.empty((num, 3 + own.shape[1]))
-        settings[:, :3], settings[:, 3:] = at, own[np.concatenate([objects.components.kind, more.kind])]
+        measure, detect = self.formulas(sensor)
         predicted, slope, detection = np.empty((num, d)), np.empty((num, d, size)), np.empty((num, 1))
-        measure.compiled()(states, settings, predicted, slope)
+        measure.compiled()(states, at[None], predicted, slope)
+        hidden = self._hidden(sensor, at, objects, more)
+        settings = np.empty((len(hidden), 4 + len(sensor.settings)))
+        settings[:, :3], settings[:, 3:-1], settings[:, -1] = at, sensor.settings, hidden
         detect.compiled(jacobian=False)(states, settings, detection)
         noise, values = sensor.covariance(scan), np.ascontiguousarray(scan.values, dtype=np.float64)
         one = len(noise) == 1
         sort = np.zeros(len(values), dtype=np.int64) if one else np.arange(len(values))
         clutter, feature = sensor.clutter_intensity(values), sensor.feature(scan, len(self.kinds))
-        return View(predicted, slope, detection[:, 0], values, noise, sort, clutter, feature, sensor.period)
+        detection = detection[:, 0] * self.visibility[np.concatenate([objects.components.kind, more.kind])]
+        return View(predicted, slope, detection, values, noise, sort, clutter, feature, sensor.period)
+
+    def _hidden(self, sensor: Sensor, at: Floats, objects: Bernoullis, more: Components) -> Floats:
+        """(N,) mass of being hidden, of the components of objects, behind others, and of more, behind any; (1,) where
+        the sensor sees through. What hides is each object's heaviest component, as surely as it exists."""
+        parts = objects.components
+        if sensor.occlusion == 0.0 or not len(objects.label):
+            return np.zeros(1)
+        best = np.array([a + parts.weight[a:b].argmax() for a, b in itertools.pairwise(parts.offset)])
+        place = np.concatenate([parts.mean[:, :2], more.mean[:, :2]])
+        kind = np.concatenate([parts.kind, more.kind])
+        x = np.empty((len(place), len(best), 4))
+        x[..., :2], x[..., 2:] = place[:, None], parts.mean[best, :2]
+        p = np.empty((len(place), len(best), 5))
+        p[..., :3], p[..., 3], p[..., 4] = at, self._radius[kind][:, None], self._radius[parts.kind[best]]
+        share = hidden_formula()(x.reshape(-1, 4), p.reshape(-1, 5)).reshape(x.shape[:2])
+        share[np.arange(len(parts.mean)), parts.group] = 0.0  # nobody hides itself
+        return np.asarray(sensor.occlusion * together(share, objects.existence))
 
     def unseen(self, scan: Scan) -> Components:
-        sensor, size = self.sensor(scan), len(self.names)
-        if not sensor.births or not len(scan.values):
-            return no_components(size, len(scan.values))
+        sensor, size, num = self.sensor(scan), len(self.names), len(scan.values)
+        if not sensor.births or not num:
+            return no_components(size, num)
         covariance = sensor.covariance(scan)
-        covariance = np.broadcast_to(covariance, (len(scan.values), *covariance.shape[1:]))
-        placed = sensor.place(scan.values, covariance, mounted(scan.pose, sensor.mount))
+        placed = sensor.place(
+            scan.values, np.broadcast_to(covariance, (num, *covariance.shape[1:])), mounted(scan.pose, sensor.mount)
+        )
         flat = FLAT**2 * placed.covariance
         # a density of objects, as far as a normal one of this width is flat at its middle
         number = self.unseen_density * 2 * math.pi * np.sqrt(np.linalg.det(flat))
-        return self._newcomers(number, placed.position, flat, placed.heading, placed.heading_std)
+        if placed.heading is None or placed.heading_std is None:
+            return self._newcomers(number, placed.position, flat)
+        wide = FLAT * placed.heading_std  # the same for the density 1 / (2 pi) of each heading
+        number = number * placed.heading.shape[1] * wide / math.sqrt(2 * math.pi)
+        return self._newcomers(number, placed.position, flat, placed.heading, wide)
 
     def arrivals(self, seconds: float) -> Bernoullis:
         if not self.places:
@@ -183,53 +280,51 @@ class Traffic:
         position = np.array([place.position for place in self.places])
         covariance = np.array([place.std**2 * np.eye(2) for place in self.places])
         existence = -np.expm1([-place.rate * seconds for place in self.places])
-        groups = [
-            self._newcomers(
-                np.ones(1),
-                position[i : i + 1],
-                covariance[i : i + 1],
-                None if place.heading is None else np.array([[place.heading[0]]]),
-                0.5 if place.heading is None else place.heading[1],
-            )
-            for i, place in enumerate(self.places)
-        ]
+        groups = list[Components]()
+        for i, place in enumerate(self.places):
+            known = () if place.heading is None else (np.array([[place.heading[0]]]), np.array([place.heading[1]]))
+            groups.append(self._newcomers(np.ones(1), position[i : i + 1], covariance[i : i + 1], *known))
         return Bernoullis(np.zeros(len(self.places), dtype=np.int64), existence, _joined(groups))
 
     def _newcomers(
-        self, number: Floats, position: Floats, covariance: Floats, heading: Floats | None, heading_std: float
+        self,
+        number: Floats,
+        position: Floats,
+        covariance: Floats,
+        heading: Floats | None = None,
+        heading_std: Floats | None = None,
     ) -> Components:
-        """B groups of components: every kind at every heading, weights summing to number (B,)."""
-        motion, num, first = self.motion, len(number), _headings(self.motion)
-        if first and heading is None:
+        """B groups of components: every kind at every heading (B, H), with standard deviation (B,), or all around;
+        weights summing to number (B,)."""
+        num, size, first = len(number), len(self.names), "heading" in self.names
+        if first and (heading is None or heading_std is None):
             heading = np.broadcast_to(np.arange(HEADINGS) * (2 * math.pi / HEADINGS), (num, HEADINGS))
+            heading_std = np.full(num, HEADING_STD)
         per = heading.shape[1] if first and heading is not None else 1
-        size, count = len(self.names), per * len(self.kinds)
+        count = per * len(self.kinds)
         mean, spread = np.zeros((num, len(self.kinds), per, size)), np.zeros((num, len(self.kinds), per, size, size))
-        mean[..., :2], spread[..., :2, :2] = position[:, None, None], covariance[:, None, None]
         weight = np.empty((num, len(self.kinds), per))
         for k, kind in enumerate(self.kinds):
-            loc, std = _state_prior(motion, kind, heading_std)
-            mean[:, k, :, 2:] = loc[2:]
-            spread[:, k, :, range(2, size), range(2, size)] = np.square(std[2:])[:, None, None]
+            loc, std = self.newcomer(kind)
+            mean[:, k] = loc
+            spread[:, k, :, range(size), range(size)] = np.square(std)[:, None, None]
             weight[:, k] = (number * kind.share / per)[:, None]
-        if first:
-            mean[..., self.names.index("heading")] = heading[:, None]  # type: ignore[index]
+        mean[..., :2], spread[..., :2, :2] = position[:, None, None], covariance[:, None, None]
+        if first and heading is not None and heading_std is not None:
+            entry = self.names.index("heading")
+            mean[..., entry], spread[..., entry, entry] = heading[:, None], np.square(heading_std)[:, None, None]
         index = np.tile(np.repeat(np.arange(len(self.kinds)), per), num)
         offset = count * np.arange(num + 1)
         return Components(offset, weight.ravel(), index, mean.reshape(-1, size), spread.reshape(-1, size, size))
 
 
-def _headings(motion: Motion) -> bool:
-    return "heading" in motion.names
-
-
 @lru_cache
-def _state_prior(motion: Motion, kind: Kind, heading_std: float) -> tuple[Floats, Floats]:
-    """Mean and standard deviation (n,) of a new object's state; those of its position are not used."""
+def _state_prior(motion: Motion, kind: Kind) -> tuple[Floats, Floats]:
+    """Mean and standard deviation (n,) of a newcomer's state; those of position and heading are zero."""
     known = {"yaw_rate": (0.0, kind.yaw_rate_std), "acceleration": (0.0, kind.acceleration_std), "speed": kind.speed}
-    known |= dict(zip(motion.extras, kind.extras, strict=True)) | {"heading": (0.0, heading_std)}
     drift = math.hypot(*kind.speed)  # of vx and vy where no heading tells which way
-    known |= {"x": (0.0, 0.0), "y": (0.0, 0.0), "vx": (0.0, drift), "vy": (0.0, drift)}
+    known |= {"vx": (0.0, drift), "vy": (0.0, drift)} | dict(zip(motion.extras, kind.extras, strict=True))
+    known |= dict.fromkeys(("x", "y", "heading"), (0.0, 0.0))
     loc, std = zip(*(known[name] for name in motion.names), strict=True)
     return np.array(loc), np.array(std)
 
@@ -238,17 +333,3 @@ def _joined(groups: Sequence[Components]) -> Components:
     offset = np.cumsum([0, *(len(group.weight) for group in groups)])
     parts = (np.concatenate([group[i] for group in groups]) for i in range(1, 5))
     return Components(offset, *parts)
-
-
-@lru_cache
-def sensor_formulas(motion: Motion, sensor: type[Sensor], num_settings: int) -> tuple[Formula, Formula]:
-    """h: (state; pose of the sensor) -> (d,), and p_D: (state; pose, settings) -> ()."""
-    label, size = sensor.__name__.lower(), len(motion.names)
-
-    def measure(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        return sensor.measure(motion.body(x, ops), p[:3], p[3:], ops)
-
-    def detect(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        return (sensor.detect(motion.body(x, ops), p[:3], p[3:], ops),)
-
-    return Formula(f"{label}_measure", measure, size, 3 + num_settings), Formula(f"{label}_detect", detect, size, 3 + num_settings)

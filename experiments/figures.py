@@ -35,7 +35,7 @@ def marginals(posterior: Posterior, scene: Scene, *, most: int = 8) -> dict[str,
         values = posterior.draws[site][(..., *index)]  # (chain, draw)
         truth = known(scene).get(site)
         _row(left, right, values, posterior.weights, bins=40)
-        left.set_ylabel(fill(posterior.label(site, index), 20))
+        left.set_ylabel(fill(posterior.title(site, index), 20))
         if truth is not None and np.shape(truth) == posterior.draws[site].shape[2:]:
             left.axhline(truth[index], color=ORANGE, ls="--", lw=1)
             right.axvline(truth[index], color=ORANGE, ls="--", lw=1)
@@ -58,7 +58,7 @@ def marginals(posterior: Posterior, scene: Scene, *, most: int = 8) -> dict[str,
 def _counted(posterior: Posterior) -> str:
     """What the model index counts, if the labels say."""
     same = (site for site in posterior.labels if np.array_equal(posterior.draws[site], posterior.model_index))  # type: ignore[arg-type]
-    return next((posterior.label(site) for site in same), "model index")
+    return next((posterior.title(site) for site in same), "model index")
 
 
 def _integer_bins(values: NDArray[np.int64]) -> list[float]:

@@ -132,7 +132,7 @@ def meanings(scores: Iterable[str], modules: Iterable[str]) -> dict[str, str]:
 def _labelled(posterior: Posterior, diagnostics: dict[str, Any]) -> dict[str, Any]:
     """Numbers with what people call them before their names, where the labels say."""
     labels = {
-        f"{site}{list(index)}" if index else site: posterior.label(site, index)
+        f"{site}{list(index)}" if index else site: posterior.title(site, index)
         for site in posterior.labels
         if site in posterior.draws
         for index in np.ndindex(posterior.draws[site].shape[2:])

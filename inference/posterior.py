@@ -59,7 +59,7 @@ class Posterior:
         first = next(iter(self.draws.values()))
         return first.shape[0], first.shape[1]
 
-    def label(self, site: str, index: tuple[int, ...] = ()) -> str:
+    def title(self, site: str, index: tuple[int, ...] = ()) -> str:
         """What people call a number of a site; 'site[i]' where nobody says."""
         if site not in self.labels:
             return site + (str(list(index)) if index else "")

@@ -1,9 +1,9 @@
 """Filters of many objects over the scans of many sensors, each in its time: what all of them share.
 
 A filter is a step from one belief to the next. Scans come in the order of their arrival, which need not be that of
-their times: one that comes late, but not by more than `patience` seconds, is put where it belongs, and the steps of the scans
-after it are done again from the belief of then. So the belief is what it would have been had all come in time. A scan
-that comes later still is left out, and told of.
+their times: one that comes late, but not by more than `patience` seconds, is put where it belongs, and the steps of the
+scans after it are done again from the belief of then. So the belief is what it would have been had all come in time. A
+scan that comes later still is left out, and told of.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -21,3 +22,5 @@ def _compiled_code_folder() -> str:
 
 
 os.environ.setdefault("NUMBA_CACHE_DIR", _compiled_code_folder())
+if "numba" in sys.modules:  # it read its settings before these were made
+    sys.modules["numba"].config.reload_config()

@@ -6,6 +6,7 @@
     squares(evidence)  a compiled sum of squares of normal latents, for least squares without tracing the program
     factors(evidence)  the whitened density factor by factor in machine code, for engines that evaluate batches
     dimension          name of the site that counts the active slots
+    labels(evidence)   {site: what people call each of its numbers, with the unit}, for figures and reports
     initial, transition, observe
                        a sequential model frame by frame, for the particle filter (models.unroll makes it one program)
     gaussian_step(state, frame)

@@ -13,6 +13,7 @@ A new sensor, motion or kind is a matter of the model: nothing of it is known he
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -114,7 +115,7 @@ class HasObjects(Protocol):
     unseen(scan) -> a group of components for each measurement: near it, weight times density is the intensity of
         objects not seen before, as far as this measurement can tell where (no components: it cannot)
     arrivals(seconds) -> objects that came at known places in this time; their labels are not read
-    check(scan) raises InputError for a scan that cannot be used
+    check(data) -> the scans in the order given; raises InputError for one that cannot be used
     """
 
     @property
@@ -134,7 +135,7 @@ class HasObjects(Protocol):
 
     def arrivals(self, seconds: float) -> Bernoullis: ...
 
-    def check(self, scan: Any) -> None: ...
+    def check(self, scans: Any) -> Sequence[Any]: ...
 
 
 def no_components(size: int, num_groups: int = 0) -> Components:

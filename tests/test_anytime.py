@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.anytime import anytime, entries, jobs_of, tabulate
+from experiments.anytime import anytime, draw, entries, jobs_of, tabulate
 from experiments.anytime_rates import (
     LEAST_RANGE,
     PAPER,
@@ -105,10 +105,21 @@ def test_the_table_ends_with_the_papers_row() -> None:
     records = tabulate({"bbvi": found}, {"bbvi": {"transform": "prior"}})
     heads, lines = entries(records)
     assert heads[-4:] == ("25 %", "50 %", "75 %", "100 %")
-    assert [line[3] for line in lines] == ["TPR [%]", "FPR [%]", "abstain [%]"] * 2
+    assert [line[3] for line in lines] == [
+        *("TPR [%]", "FPR [%]", "abstain, at the end [%]"),
+        *("TPR [%]", "FPR [%]", "abstain [%]"),
+    ]
     assert lines[0][:3] == ("bbvi", "the prior", "8") and lines[0][-1].startswith("100.0 ± ")
     assert lines[3][4:] == ("61.5", "74.5", "81.8", "92.2") and lines[5][-1] == "3.1"
     assert PAPER["fpr"][0] == 0.364
+
+
+def test_a_start_that_is_there_already_needs_no_iterations() -> None:
+    found = Outcomes(np.array([0.0, 8.0]), np.array([[True, True]]), np.array([True]))
+    _, lines = entries(tabulate({"bbvi": found}, {"bbvi": {"transform": "laplace"}}))
+    assert lines[0][2] == "none: there from the start"
+    (drawn,) = draw(tabulate({"bbvi": found}, {"bbvi": {}}), {"bbvi": found}).texts
+    assert "bbvi abstains on 0.0% of the scenes" in drawn.get_text()
 
 
 @pytest.mark.parametrize(

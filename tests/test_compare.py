@@ -59,13 +59,24 @@ def test_an_engine_nobody_asked_for_may_refuse_the_model(launch: Command) -> Non
     words = ["scenario=slot_road", "model=slot_road", "seeds=1", "rjmcmc.num_steps=60", "rjmcmc.warmup=20"]
     done = launch(*words, module="experiments.compare")
     assert done.returncode == 0, done.stderr
-    assert "least_squares: SlotRoad counts with discrete latents" in done.stdout
+    assert "least_squares: SlotRoad has an unknown number of parts" in done.stdout
     assert "choose engine=rjmcmc or smc_structure (from Python: " in done.stdout
-    done = launch(*words[:3], "engines=[least_squares]", module="experiments.compare")
-    assert done.returncode == 2 and "none, no engine ran" in done.stdout
-    done = launch(*words, "engines=[least_squares,rjmcmc]", module="experiments.compare")
-    assert done.returncode == 1
-    assert "reference: posterior of rjmcmc" in done.stdout  # of the first that ran
+
+
+def test_an_engine_asked_for_that_refuses_the_model_is_noticed_before_any_works(launch: Command) -> None:
+    words = ["scenario=slot_road", "model=slot_road", "seeds=1", "engines=[rjmcmc,least_squares]"]
+    done = launch(*words, "rjmcmc.num_steps=1000000000", module="experiments.compare")
+    assert done.returncode == 2 and not done.stdout and not Path("runs").exists()
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("least_squares: SlotRoad has an unknown number of parts")
+    assert "choose engine=rjmcmc or smc_structure" in sentence
+
+
+def test_a_scenario_that_the_model_does_not_read_is_told_once(launch: Command) -> None:
+    done = launch("scenario=line", "model=slot_road", "engines=[rjmcmc,smc]", module="experiments.compare")
+    assert done.returncode == 2
+    (sentence,) = done.stderr.splitlines()
+    assert "model SlotRoad reads Markings, but the scenario gives Readings" in sentence
 
 
 @pytest.mark.parametrize(

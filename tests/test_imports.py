@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -63,3 +64,12 @@ def test_help_and_dry_run_import_nothing_heavy(words: list[str], tmp_path: Path)
     assert "num_steps" in done.stdout, done.stderr
     assert done.stdout.rstrip().endswith("HEAVY []")
     assert not list(tmp_path.iterdir()), "a dry run writes nothing"
+
+
+def test_compiled_code_lies_in_the_folder_of_these_sources_whichever_is_imported_first() -> None:
+    """numba looks for the folder once: without it an edit of a function leaves its callers' old machine code in use."""
+    for first in ("import numba, models", "import models, numba", "import experiments.road_metrics, numba"):
+        code = f"import os\n{first}\nprint(numba.config.CACHE_DIR == os.environ['NUMBA_CACHE_DIR'] != '')"
+        unset = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+        done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=unset, capture_output=True, text=True)
+        assert done.stdout.strip() == "True", done.stderr

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 
 from experiments import store
 from experiments.command import guarded, plain
-from experiments.learn import Held, difference, learn, node_of, plan, sentence, table_of, task_of
+from experiments.learn import Held, compared, difference, learn, node_of, plan, sentence, table_of, task_of
 from experiments.schema import build
 from inference.empirical_bayes import Learnt
 from models.capability import Hyper
@@ -32,6 +32,7 @@ def test_what_was_learnt_runs_as_an_experiment(
     assert list(rows) == ["clutter", "delineator.right.mean", "delineator.right.std"]
     assert float(rows["clutter"]["configured"]) == pytest.approx(0.05)
     assert "delineator.right.mean" in said and "log evidence of a held-out scene" in said
+    assert "change ± s.e." in said
     assert len(store.read_json(folder / "held_out.json")["gain"]) == 3
     assert (folder / "figures" / "settings.png").exists() and "<img" in (folder / "report.html").read_text()
 
@@ -58,6 +59,8 @@ def test_what_was_learnt_runs_as_an_experiment(
         (["held_out=none"], "held_out is 'none'; give a whole number"),
         (["num_draws=5"], "num_draws is 5; learning needs 20 or more"),
         (["learn=[]"], "learn is empty"),
+        (["learn=[clutter"], "cannot read the setting 'learn=[clutter'"),
+        (["learn=clutter,bicycle"], "'bicycle' cannot be learnt"),
         (["learn=[delineatr.std]"], "did you mean 'delineator.std'?"),
         (["learn=bicycle"], "'bicycle' cannot be learnt: no scene has a bicycle"),
         (["scenario.seed=3"], "learning numbers its scenes itself"),
@@ -127,6 +130,18 @@ def test_errors_are_told_in_natural_numbers() -> None:
     first, second = table_of(family, learnt)
     assert first[1:] == pytest.approx((0.0, 2.0, 0.3, 0.1))
     assert second[1:] == pytest.approx((1.0, np.e, 0.2 * np.e, 0.1 * np.e))
+
+
+def test_a_score_has_the_standard_error_of_its_change_over_the_same_scenes() -> None:
+    """What scenes have in common cancels. 1000 resamples tell a standard error to 2 %; four of these."""
+    rng = np.random.default_rng(1)
+    scene, change = rng.normal(0.0, 10.0, 200), rng.normal(0.5, 0.3, 200)
+    found = compared(scene, scene + change, np.nanmean)
+    assert found.after - found.before == pytest.approx(change.mean())
+    assert found.error == pytest.approx(change.std(ddof=1) / 200**0.5, rel=0.09)
+    assert compared(scene, scene, np.nanmedian).error == 0.0
+    gaps = np.where(np.arange(200) < 199, np.nan, 1.0)  # one scene alone has the score
+    assert compared(gaps, gaps + 1.0, np.nanmean)[:2] == (1.0, 2.0)
 
 
 def test_the_gain_is_told_with_its_standard_error() -> None:

@@ -6,13 +6,17 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks import road
+from benchmarks.plain_road import PlainRoad
 from benchmarks.road_robust import quarters
-from benchmarks.road_trials import Effort, paired_loss
+from benchmarks.road_trials import MODEL, Effort, frozen, paired_loss
 from benchmarks.timing import THREADS
+from models.program import log_joint
 
 TINY = Effort(scenes=3, some=2, timed=2)
+SITES = ("course", "offset")
 PROMISED = {
     "tpr_mid": ">= 0.95",
     "fpr_mid": "<= 0.04",
@@ -76,3 +80,32 @@ def test_all_iterations_are_the_first_count_within_half_a_point_of_the_last() ->
 def test_a_loss_is_counted_scene_by_scene() -> None:
     loss, told = paired_loss([True, True, True, False], [True, False, False, True])
     assert loss == 0.25 and told == f"n = 4, s.e. {np.std([0, 1, 1, -1]) / 2:.3f}"
+
+
+def test_the_program_of_torch_alone_has_the_density_and_gradient_of_the_compiled_one() -> None:
+    plain = PlainRoad(MODEL)
+    for scene in frozen(3):
+        evidence, rng = MODEL.prepare(scene.data), np.random.default_rng(0)
+        near = {site: scene.truth[site] + 0.02 * rng.standard_normal((8, len(scene.truth[site]))) for site in SITES}
+        latents = {site: torch.from_numpy(value).requires_grad_() for site, value in near.items()}
+        ours, theirs = (log_joint(model, latents, evidence) for model in (MODEL, plain))
+        torch.testing.assert_close(theirs, ours, rtol=1e-10, atol=1e-9)
+        slopes = (torch.autograd.grad(height.sum(), list(latents.values())) for height in (ours, theirs))
+        for a, b in zip(*slopes, strict=True):
+            torch.testing.assert_close(b, a, rtol=1e-8, atol=1e-7)
+
+
+def test_a_course_whose_ends_no_clothoid_joins_has_the_same_height_in_both_programs() -> None:
+    evidence, scene = MODEL.prepare(frozen(1)[0].data), frozen(1)[0]
+    latents = {site: torch.from_numpy(scene.truth[site].copy()) for site in SITES}
+    latents["course"][3:] = torch.tensor([-100.0, 0.0, 0.0])
+    ours, theirs = (log_joint(model, latents, evidence) for model in (MODEL, PlainRoad(MODEL)))
+    assert torch.isfinite(ours) and ours < -1e8
+    torch.testing.assert_close(theirs, ours)
+
+
+def test_ranges_gained_are_told_against_all_baselines(capsys: pytest.CaptureFixture[str]) -> None:
+    assert road.main(["--json", "--only", "range_gain"], effort=TINY) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["range_gain"] <= found["range_gain_seen"]  # trusting markings less leaves more to gain
+    assert 0.0 < found["range_gain_near"] < 3.0

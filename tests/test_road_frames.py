@@ -284,3 +284,17 @@ def test_bad_drives_are_refused_in_a_sentence() -> None:
     with pytest.raises(InputError, match=r"^scenario night_drive: seed is -1"):
         night_drive(-1)
     assert Drift() == MODEL.drift
+
+
+def test_a_standing_car_keeps_its_road_but_for_a_trace_of_noise() -> None:
+    """The covariance of the step stays positive definite where nothing unrolls, and moves nothing to speak of."""
+    pose, drift = np.zeros(3), np.zeros((3, 3))
+    still = FRAMES[1]._replace(pose=pose, drift=drift, seconds=0.0)
+    road, offset = about_truth(2)
+    step = MODEL.gaussian_step({"road": road, "offset": offset}, still)
+    np.testing.assert_allclose(step.mean, torch.cat([road, offset], -1).numpy(), rtol=1e-8, atol=1e-9)
+    noise, prior = np.linalg.norm(step.tril, axis=1), MODEL.course.prior
+    assert (step.tril.diagonal() > 0.0).all()
+    assert noise[0] < 1e-3 and noise[1] < 1e-4  # [m], [rad]
+    assert (noise[2:4] < 1e-4 * np.array([prior.curvature_std, prior.rate_std])).all()
+    assert (noise[4:] < 1e-4 * still.evidence.offset_std).all()

@@ -72,3 +72,39 @@ def test_a_vehicle_that_changes_lanes_is_recognised_and_counts_for_little() -> N
     near, wrong = (np.median(v, 0)[1] / np.median(without, 0)[1] for v in (wary, misled))  # 80 m ahead
     assert near < 1.25
     assert wrong > 1.5
+
+
+def test_a_vehicle_is_remarked_where_it_rather_leaves_the_road(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = night_road(SEEDS[0], lane_change=True)
+    evidence = MODEL.prepare(scene.data)
+    first = int(evidence.group[evidence.moves][0])
+    for share, told in ((0.45, 1), (0.55, 0)):
+        follows = np.where(evidence.group == first, share, 0.9)
+        monkeypatch.setattr(RoadCourse, "follows", lambda *_, found=follows: found)
+        remarks = MODEL.remarks(evidence, {})
+        assert len(remarks) == told
+        assert all(remark.startswith(f"{evidence.names[first]} changes lanes") for remark in remarks)
+
+
+@pytest.mark.parametrize(("num", "told"), [(4, False), (6, True)])
+def test_more_clutter_than_there_can_be_is_remarked(num: int, told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 24 cues with 5 % of clutter, P(4 or more) = .03 and P(6 or more) = .0009. A vehicle that changes lanes, all of
+    its detections, is none of them."""
+    evidence = MODEL.prepare(night_road(SEEDS[0]).data)
+    group = np.r_[np.zeros(24, dtype=np.int64), np.ones(9, dtype=np.int64)]
+    evidence = evidence._replace(group=group, moves=group == 1, names=("post left", "car 3"))
+    follows = np.where(group == 1, 0.1, np.where(np.arange(33) < num, 0.0, 1.0))
+    monkeypatch.setattr(RoadCourse, "follows", lambda *_: follows)
+    remarks = MODEL.remarks(evidence, {})
+    assert remarks[-1].startswith("car 3 changes lanes") and len(remarks) == 1 + told
+    if told:
+        assert remarks[0].startswith("6 of 24 cues are taken for clutter, where 5% are expected")
+
+
+def test_a_road_that_misses_most_cues_is_remarked() -> None:
+    """Draws 8 m beside the estimate, against the estimate."""
+    scene = night_road(SEEDS[0])
+    evidence, draws = MODEL.prepare(scene.data), run(MODEL, scene.data, 0).resample(100, 0)
+    assert not any("clutter" in remark for remark in MODEL.remarks(evidence, draws))
+    beside = draws | {"course": draws["course"] + np.array([0.0, 8.0, 0.0, 0.0, 8.0, 0.0])}
+    assert any("are taken for clutter" in remark for remark in MODEL.remarks(evidence, beside))

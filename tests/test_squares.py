@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from inference import least_squares, squares
+from inference.arrow import squared_norm
 from inference.posterior import Posterior
 from models.capability import Chart, Squares
 from models.program import InputError, log_joint
@@ -209,6 +210,15 @@ def test_too_few_steps_are_flagged_with_a_remedy() -> None:
     posterior = least_squares.run(Valley(), SEEN, seed=0, num_steps=5, init={"z": np.array([-1.2, 1.0])})
     assert posterior.info["converged"] is False
     assert "raise num_steps" in posterior.info["flags"][0]
+
+
+def test_a_search_whose_steps_run_out_at_the_minimum_has_converged() -> None:
+    """Kinks of a density make the last steps gain next to nothing for ever."""
+    near = minimise(VALLEY, np.array([-1.2e-4, 1e-4])).state.x
+    for away, converged in ((1e-9, True), (1e-4, False)):
+        path = minimise(VALLEY, near + np.array([away, 0.0]), num_steps=0, tolerance=0.0)
+        left = 0.5 * squared_norm(path.factor, path.state.gradient)
+        assert path.converged is converged is (left <= squares.NEAR), left
 
 
 class Uphill(CompiledLine):

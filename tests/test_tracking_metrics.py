@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.scenarios.scene import Scene, TrafficTruth
-from experiments.tracking_metrics import counts, judge, metrics, times_of
+from experiments.tracking_metrics import counts, judge, metrics, times_of, timing
 from inference.posterior import Posterior
 from inference.tracks import Tracks
 from models.program import InputError
@@ -152,3 +152,11 @@ def test_counts_are_told_at_scans_evenly_over_time() -> None:
     found = counts(believed(traffic()), scans=3)
     assert list(found) == ["count[0]", "count[10]", "count[19]"]
     assert list(counts(believed(traffic()), scans=1000)) == [f"count[{t}]" for t in range(20)]
+
+
+def test_seconds_of_scans_are_told_in_milliseconds() -> None:
+    tracks, scene = believed(traffic()), Scene(None, None, "", {})
+    slow = replace(tracks, info={"step_seconds": [0.001] * 99 + [0.5]})
+    assert timing(slow, scene)["step_ms"] == pytest.approx(1.0)
+    assert timing(slow, scene)["step_p99_ms"] == pytest.approx(1.0 + 0.01 * 499.0)  # between the two longest
+    assert timing(replace(tracks, info={}), scene) == {}

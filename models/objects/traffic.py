@@ -174,16 +174,17 @@ class Traffic:
 
     def prepare(self, recording: Recording) -> tuple[ScanFrame, ...]:
         """The frames of a recording, in its order. Raises InputError for a scan that cannot be used (`check`)."""
-        return frames_of(self, [self._usable(scan) for scan in recording.scans])
+        return frames_of(self, self.check(recording.scans))
 
-    def check(self, scan: Scan | ScanFrame) -> None:
-        """Raise InputError for a scan that cannot be used: of a sensor that the model has not, or with numbers that no
-        sensor gives (models.objects.scans)."""
-        self._usable(_scan(scan))
-
-    def _usable(self, scan: Scan) -> Scan:
-        sensor = self.sensor(scan)
-        return check_scan(scan, sensor.names, len(self.kinds), probabilities=sensor.scores_are_probabilities)
+    def check(self, scans: Sequence[Scan | ScanFrame]) -> tuple[Scan, ...]:
+        """The scans in the order given, those of frames for frames. Raises InputError for a sensor that the model has
+        not, and for numbers that no sensor gives (models.objects.scans)."""
+        found = list[Scan]()
+        for scan in scans:
+            scan = scan.scan if isinstance(scan, ScanFrame) else scan
+            sensor = self.sensor(scan)
+            found.append(check_scan(scan, sensor.names, len(self.kinds), probabilities=sensor.scores_are_probabilities))
+        return tuple(found)
 
     def __call__(self, frames: Sequence[ScanFrame]) -> None:
         unroll(self)(in_order(frames))
@@ -207,8 +208,7 @@ class Traffic:
         noise_formula(self.motion).compiled(jacobian=False)(mean, settings, noise)
         return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self._lifetime[kind]))
 
-    def view(self, scan: Scan | ScanFrame, objects: Bernoullis, more: Components) -> View:
-        scan = _scan(scan)
+    def view(self, scan: Scan, objects: Bernoullis, more: Components) -> View:
         sensor = self.sensor(scan)
         at = mounted(scan.pose, sensor.mount)
         states = np.concatenate([objects.components.mean, more.mean])
@@ -243,8 +243,7 @@ class Traffic:
         share[np.arange(len(parts.mean)), parts.group] = 0.0  # nobody hides itself
         return np.asarray(sensor.occlusion * together(share, objects.existence))
 
-    def unseen(self, scan: Scan | ScanFrame) -> Components:
-        scan = _scan(scan)
+    def unseen(self, scan: Scan) -> Components:
         sensor, size, num = self.sensor(scan), len(self.names), len(scan.values)
         if not sensor.births or not num:
             return no_components(size, num)
@@ -303,11 +302,6 @@ class Traffic:
         index = np.tile(np.repeat(np.arange(len(self.kinds)), per), num)
         offset = count * np.arange(num + 1)
         return Components(offset, weight.ravel(), index, mean.reshape(-1, size), spread.reshape(-1, size, size))
-
-
-def _scan(scan: Scan | ScanFrame) -> Scan:
-    """That of a frame of the program: filters read both."""
-    return scan.scan if isinstance(scan, ScanFrame) else scan
 
 
 @lru_cache

@@ -34,13 +34,14 @@ import torch
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 from scipy.special import ndtri
+from scipy.stats import binom
 
 from models.capability import Chart, Factors, Hyper, Squares
 from models.program import InputError
 from models.road.along_road import CuesAlongRoad, cue_arrays, kernel_settings
-from models.road.cue_kernel import SPREADS
+from models.road.cue_kernel import CHANGES, SPREADS
 from models.road.cues import KINDS, CueKind, Cues
-from models.road.evidence import RoadEvidence, road_evidence
+from models.road.evidence import COURSE_LABELS, RoadEvidence, offset_labels, road_evidence
 from models.road.hyper import hyper
 from models.road.kernel import density_slopes, group_densities, normal_equations
 from models.road.numbers import log_volumes, number_moments, prior_root, to_courses, to_numbers
@@ -48,6 +49,7 @@ from models.road.prior import USUAL_ROADS, CoursePrior, course_moments
 
 Floats = NDArray[np.float64]
 FIRST_ROADS = (8, 2)  # places and directions of the end that a start is the best of
+IMPLAUSIBLE = 2e-3  # chance of so much clutter
 SUSPECT = 0.5  # a vehicle that rather leaves the road than follows it
 FOGS = (3.0, 1.0, 0.4)  # [m]
 
@@ -104,6 +106,10 @@ class RoadCourse:
         offset = pyro.sample("offset", dist.Normal(loc, std).to_event(1))
         pyro.sample("cues", CuesAlongRoad(self, evidence, course, offset), obs=evidence.cues)
 
+    def labels(self, evidence: RoadEvidence) -> dict[str, tuple[str, ...]]:
+        """What the numbers of each site are."""
+        return {"course": COURSE_LABELS, "offset": offset_labels(evidence)}
+
     @property
     def num_samples(self) -> int:
         """Samples of a course, about `spacing` apart."""
@@ -123,6 +129,8 @@ class RoadCourse:
         course, num, paper, cues, group = self._kernel(evidence)
         centre, scale = np.r_[np.zeros(6), loc], np.r_[np.ones(6), std]
         roads, sharp = first_roads(self.prior), cues[:, SPREADS].copy()
+        chance = cues[:, CHANGES].copy()
+        cues[:, CHANGES] = 0.0  # in thick fog a vehicle that changes lanes looks like one that does not
         x = np.concatenate([roads, np.zeros((len(roads), len(loc)))], 1)
         cues[:, SPREADS] = sharp + FOGS[0] ** 2
         heights = np.empty((len(x), 1 + len(loc)))
@@ -131,6 +139,8 @@ class RoadCourse:
         hessian, gradient = np.zeros((len(best), len(best))), np.empty(len(best))
         for fog in FOGS:
             cues[:, SPREADS] = sharp + fog**2
+            if fog == FOGS[-1]:
+                cues[:, CHANGES] = chance
             normal_equations(centre + scale * best, course, num, paper, cues, group, hessian, gradient)  # type: ignore[call-arg]
             whole = np.eye(len(best)) + scale[:, None] * hessian * scale
             best = best - dposv(whole, best + scale * gradient, lower=1)[1]
@@ -185,10 +195,21 @@ class RoadCourse:
         return CuesAlongRoad(self, evidence, course, offset).whitened(evidence.cues)[..., 2].nanmean(0).numpy()
 
     def remarks(self, evidence: RoadEvidence, draws: dict[str, Floats]) -> list[str]:
-        """Vehicles that rather change lanes, or turn off, than follow the road, in words."""
+        """What speaks against the draws, in words: vehicles that rather change lanes, or turn off, than follow the
+        road; and more cues taken for clutter than there can be, which tells of a wrong mode.
+
+        m of n cues are too many where Binomial(n, clutter) has m or more with a probability below IMPLAUSIBLE."""
         follows = self.follows(evidence, draws)
         shares = {int(g): follows[evidence.group == g].mean() for g in np.unique(evidence.group[evidence.moves])}
-        return [
+        rest = follows[~np.isin(evidence.group, [g for g, share in shares.items() if share < SUSPECT])]
+        lost = int(np.nansum(1.0 - rest))
+        found = []
+        if binom.sf(lost - 1, len(rest), self.clutter) < IMPLAUSIBLE:
+            found.append(
+                f"{lost} of {len(rest)} cues are taken for clutter, where {self.clutter:.0%} are expected: another "
+                "road may explain them; compare with engine=importance_prior, or raise clutter"
+            )
+        return found + [
             f"{evidence.names[g]} changes lanes or turns off (it follows the road with a probability of {share:.2g}) "
             "and counts for little"
             for g, share in shares.items()

@@ -115,7 +115,7 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     elif seen > 0.0:
         log_density = height + math.log(root * seen)
     else:
-        log_density = height + math.log(root) + normal_share(sight)[0]
+        log_density = height + math.log(root) + normal_share(sight, seen)[0]
     if len(rows) == 0:
         return log_density, weight
     rows[:] = 0.0
@@ -127,7 +127,7 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
     rows[2, 0], rows[2, 1], rows[2, 3] = turn, -bend * precision, -precision
     rows[2, 4] = -along * precision
     if sight < FAR_INSIDE:
-        _, mills, bent = normal_share(sight)
+        _, mills, bent = normal_share(sight, seen)
         pull = math.sqrt(bent)
         unlike = 2.0 * (variance - spread) - cues[n, SXX] - cues[n, SYY]  # m' Sigma m - t' Sigma t
         slant_turn = (unlike + 2.0 * slant * skew) / variance  # d slant / d heading
@@ -142,12 +142,11 @@ def exact_cue(cues, n, offset, table, k, changes, rows):  # type: ignore[no-unty
 
 
 @nb.njit(error_model="numpy")
-def normal_share(x):  # type: ignore[no-untyped-def]
-    """log Phi(x), its slope phi / Phi, and minus its second derivative."""
-    if x > UNDERFLOW:
-        log_share = math.log(0.5 * math.erfc(-x * ROOT_HALF))
-        slope = math.exp(-0.5 * x * x - LOG_ROOT - log_share)
-        return log_share, slope, slope * (x + slope)
+def normal_share(x, share):  # type: ignore[no-untyped-def]
+    """log Phi(x), its slope phi / Phi, and minus its second derivative; share is Phi(x), or 0 past UNDERFLOW."""
+    if share > 0.0:
+        slope = math.exp(-0.5 * x * x - LOG_ROOT) / share
+        return math.log(share), slope, slope * (x + slope)
     y = 1.0 / (x * x)
     series = -y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y)))
     log_share = -0.5 * x * x - math.log(-x) - LOG_ROOT + math.log1p(series)
@@ -189,22 +188,33 @@ def find_samples(cues, table, step, near):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(error_model="numpy")
-def score_groups(paper, cues, group, near, offset, table, out, changes):  # type: ignore[no-untyped-def]
+def score_groups(paper, cues, group, near, offset, table, out, changes, rows=None, weights=None):  # type: ignore[no-untyped-def]
     """Log densities of groups, out (G,), at offsets (G,) [m], and the probability of each to change lanes, (G,).
 
-    near  (N,) the sample of the table that each cue is scored about"""
-    rows, there = np.empty((0, LOCAL)), np.zeros(len(offset))
+    near     (N,) the sample of the table that each cue is scored about
+    rows     (2, N, RESIDUALS, LOCAL) of every cue if it follows the road, and if its vehicle changes lanes; the latter
+             are not filled where it cannot
+    weights  (2, N) probabilities of both"""
+    none, there = np.empty((0, LOCAL)), np.zeros(len(offset))
     out[:] = 0.0
     changes[:] = 0.0
     for n in range(len(cues)):
         g, k = group[n], near[n]
-        out[g] += score_cue(paper, cues, n, offset[g], table, k, rows)[0]
+        if weights is None:  # known when this is compiled
+            out[g] += score_cue(paper, cues, n, offset[g], table, k, none)[0]
+        else:
+            height, weights[0, n] = score_cue(paper, cues, n, offset[g], table, k, rows[0, n])
+            out[g] += height
         if cues[n, CHANGES] > 0.0:
             changes[g] = cues[n, CHANGES]
-            there[g] += exact_cue(cues, n, offset[g], table, k, True, rows)[0]
+            there[g] += exact_cue(cues, n, offset[g], table, k, True, none if rows is None else rows[1, n])[0]
     for g in range(len(offset)):
         if changes[g] > 0.0:
             out[g], changes[g] = with_changes(changes[g], out[g], there[g])
+    if weights is not None:
+        for n in range(len(cues)):
+            weights[0, n] *= 1.0 - changes[group[n]]
+            weights[1, n] = changes[group[n]]
 
 
 @nb.njit(error_model="numpy")

@@ -51,6 +51,15 @@ class RoadEvidence(NamedTuple):
     arc: Floats | None = None
 
 
+COURSE_LABELS = tuple(f"{end} {what}" for end in ("start", "end") for what in ("x [m]", "y [m]", "heading [rad]"))
+ROAD_LABELS = ("start y [m]", "start heading [rad]", "start curvature [1/m]", "curvature rate [1/m²]")
+
+
+def offset_labels(evidence: RoadEvidence) -> tuple[str, ...]:
+    """What the offsets (G,) are, for reports."""
+    return tuple(f"offset of {name} [m]" for name in evidence.names)
+
+
 def road_evidence(cues: Cues, kinds: Sequence[CueKind]) -> RoadEvidence:
     """The evidence of cues whose kinds are known by name.
 

@@ -42,7 +42,7 @@ from models.road import fork_kernel, fork_moves
 from models.road.along_fork import CuesAlongFork, Fork, kernel_data, kernel_settings, packed
 from models.road.course import RoadCourse
 from models.road.cues import Cues
-from models.road.evidence import RoadEvidence
+from models.road.evidence import ROAD_LABELS, RoadEvidence, offset_labels
 from models.road.fork_kernel import COURSES, HEAD, JOINS, MAIN, SECOND_BEND, SECOND_RATE, SHARED
 
 Floats = NDArray[np.float64]
@@ -107,6 +107,17 @@ class ForkedRoad:
     def prepare(self, cues: Cues) -> RoadEvidence:
         """Evidence of this model, as RoadCourse prepares it."""
         return self.road.prepare(cues)
+
+    def labels(self, evidence: RoadEvidence) -> dict[str, tuple[str, ...]]:
+        """What the numbers of each site are."""
+        return {
+            "main": ROAD_LABELS,
+            "num_courses": ("number of courses",),
+            "joins": ("joins (1) or leaves (0)",),
+            "shared": ("road shared [m]",),
+            "bend": ("curvature of the second against the main course [1/m]", "and its rate [1/m²]"),
+            "offset": offset_labels(evidence),
+        }
 
     def moves(self) -> tuple[Move, ...]:
         """The moves of models.road.fork_moves, batched; the compiled chain calls the same function."""

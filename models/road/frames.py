@@ -46,7 +46,7 @@ from models.road.along_road import cue_arrays, scatter
 from models.road.course import RoadCourse
 from models.road.drive import RoadDrive, RoadFrame, road_frames
 from models.road.ego import Drift
-from models.road.evidence import RoadEvidence
+from models.road.evidence import COURSE_LABELS, ROAD_LABELS, RoadEvidence, offset_labels
 from models.road.frame_kernel import ROAD, frame_densities, frame_slopes
 from models.unroll import unroll
 
@@ -89,6 +89,13 @@ class RoadFrames:
     def prepare(self, drive: RoadDrive) -> tuple[RoadFrame, ...]:
         """The frames of a drive; see models.road.drive for what raises."""
         return road_frames(drive, self.course, self.drift)
+
+    def labels(self, frames: Sequence[RoadFrame]) -> dict[str, tuple[str, ...]]:
+        """What the numbers of each frame's state are."""
+        own = {"road": ROAD_LABELS, "offset": offset_labels(frames[0].evidence), "course": COURSE_LABELS}
+        return {
+            site: tuple(f"frame {t}: {n}" for t in range(len(frames)) for n in names) for site, names in own.items()
+        }
 
     def initial(self, frame: RoadFrame) -> State:
         return self._sample(self._first(frame))

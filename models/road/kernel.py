@@ -15,7 +15,7 @@ import numpy as np
 
 from models.clothoid_kernel import COLUMNS, COS, LENGTH, SIN, hermite_one, sample_one
 from models.road.course_slopes import hermite_slopes, moments, sample_row
-from models.road.cue_kernel import LOCAL, LOG_ROOT, RESIDUALS, exact_cue, find_samples, score_cue, score_groups
+from models.road.cue_kernel import LOCAL, LOG_ROOT, RESIDUALS, find_samples, score_cue, score_groups
 from models.road.numbers import affine, course_density
 
 NO_ROAD = -1e9  # [nats]
@@ -58,34 +58,31 @@ def group_densities(x, course, num, paper, cues, group, loc, std, out):  # type:
 def linearise(theta, offset, num, paper, cues, group, gradient, hessian):  # type: ignore[no-untyped-def]
     """Log density of all cues beside the clothoid theta (6,) at offsets (G,) [m]; its gradient (6 + G,) in both and,
     unless empty, minus its expected second derivatives (6 + G, 6 + G), of which the lower half is filled."""
-    full, groups = len(hessian) > 0, len(offset)
-    table, rows = np.empty((num, COLUMNS)), np.empty((RESIDUALS, LOCAL))
-    moment, row, near = np.empty((num, 4)), np.empty(6), np.empty(len(cues), np.int64)
-    height, changes = np.empty(groups), np.empty(groups)
+    full, groups, num_cues = len(hessian) > 0, len(offset), len(cues)
+    table, moment, near = np.empty((num, COLUMNS)), np.empty((num, 4)), np.empty(num_cues, np.int64)
+    rows, weights = np.empty((2, num_cues, RESIDUALS, LOCAL)), np.empty((2, num_cues))
+    height, changes, local, row = np.empty(groups), np.empty(groups), np.empty(LOCAL), np.empty(6)
     step = sample_one(theta, table)
     moments(table, step, moment)
     find_samples(cues, table, step, near)
-    score_groups(paper, cues, group, near, offset, table, height, changes)
+    score_groups(paper, cues, group, near, offset, table, height, changes, rows, weights)
     gradient[:] = 0.0
     hessian[:] = 0.0
-    local = np.empty(LOCAL)
-    for n in range(len(cues)):
+    for n in range(num_cues):
         k, g = near[n], group[n]
         c, s = table[k, COS], table[k, SIN]
         dx, dy = cues[n, 0] - table[k, 0], cues[n, 1] - table[k, 1]
         along, across = dx * c + dy * s, dy * c - dx * s
         local[:] = 0.0  # the gradient in the local numbers
         for leaves in range(2 if changes[g] > 0.0 else 1):
-            if leaves:
-                weight = changes[g] * exact_cue(cues, n, offset[g], table, k, True, rows)[1]
-            else:
-                weight = (1.0 - changes[g]) * score_cue(paper, cues, n, offset[g], table, k, rows)[1]
+            weight = weights[leaves, n]
             for r in range(RESIDUALS):
+                part = rows[leaves, n, r]
                 for j in range(1, LOCAL):
-                    local[j] -= weight * rows[r, 0] * rows[r, j]
+                    local[j] -= weight * part[0] * part[j]
                 if full:
-                    chain(rows[r], c, s, along, across, k, theta, table, moment, row)
-                    add_square(weight, row, rows[r, 5], 6 + g, hessian)
+                    chain(part, c, s, along, across, k, theta, table, moment, row)
+                    add_square(weight, row, part[5], 6 + g, hessian)
         chain(local, c, s, along, across, k, theta, table, moment, row)
         gradient[6 + g] += local[5]
         for i in range(6):

@@ -38,7 +38,7 @@ from models.program import InputError, Latents
 from models.road.along_road import cue_arrays, scatter
 from models.road.course import RoadCourse
 from models.road.cues import Cues
-from models.road.evidence import RoadEvidence
+from models.road.evidence import COURSE_LABELS, RoadEvidence, offset_labels
 from models.road.segment_data import best_start, bound_evidence, bound_nothing, log_counts
 from models.road.segment_kernel import SHAPE, commit, cue_densities, evaluate, pack, samples_of, unpack
 from models.road.segment_moves import NAMES, PROBABILITIES, propose
@@ -85,6 +85,16 @@ class SegmentedRoad:
     def prepare(self, cues: Cues) -> RoadEvidence:
         """Evidence of this model. Raises InputError for cues that no course can be computed from."""
         return self.course.prepare(cues)
+
+    def labels(self, evidence: RoadEvidence) -> dict[str, tuple[str, ...]]:
+        """What the numbers of each site are."""
+        return {
+            "num_knots": ("number of knots",),
+            "start": COURSE_LABELS[:3],
+            "curvature": ("start curvature [1/m]",),
+            "rate": ("curvature rate past the last knot [1/m²]",),
+            "offset": offset_labels(evidence),
+        }
 
     def start(self, evidence: RoadEvidence) -> dict[str, Any]:
         """The most probable of the fits with 0, 1, .. max_knots knots at equal distances."""

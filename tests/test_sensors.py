@@ -179,7 +179,8 @@ def test_first_measurements_have_the_intensity_of_unseen_objects(flat: float, mo
             H, d = view.slope[c], len(sensor.names)
             S = H @ unseen.covariance[c] @ H.T + view.noise[view.sort[j]]
             gap = view.values[j] - view.predicted[c]
-            gap -= np.where(np.isinf(view.period), 0.0, view.period * np.round(gap / view.period))
+            turn = np.where(np.isinf(view.period), 1e9, view.period)
+            gap -= turn * np.round(gap / turn)
             height = math.exp(-0.5 * gap @ np.linalg.solve(S, gap)) / math.sqrt(np.linalg.det(2 * math.pi * S))
             rho[j] += unseen.weight[c] * view.detection[c] * height
             assert d == len(gap)
@@ -193,38 +194,34 @@ def test_first_measurements_have_the_intensity_of_unseen_objects(flat: float, mo
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ladar(Sensor):
-    """A sensor that nothing but this test knows: inverse range and the position across, in its own frame."""
+class Sonar(Sensor):
+    """A sensor that nothing but this test knows: the logarithm of the range [m], and the bearing [rad]."""
 
-    names: ClassVar[tuple[str, ...]] = ("nearness", "across")
+    names: ClassVar[tuple[str, ...]] = ("log_range", "bearing")
 
     @staticmethod
     def measure(body: Body, at: Any, ops: Any) -> Any:
         dx, dy = body.x - at[0], body.y - at[1]
-        return (1.0 / ops.sqrt(dx * dx + dy * dy), ops.cos(at[2]) * dy - ops.sin(at[2]) * dx)
+        return (0.5 * ops.log(dx * dx + dy * dy), ops.atan2(dy, dx) - at[2])
 
     def place(self, values: Floats, noise: Floats, at: Floats) -> Placed:
-        distance, across = 1.0 / values[:, 0], values[:, 1]
-        along = np.sqrt(np.square(distance) - np.square(across))
-        cos, sin = math.cos(at[2]), math.sin(at[2])
-        position = np.stack([at[0] + cos * along - sin * across, at[1] + sin * along + cos * across], -1)
-        slope = np.zeros((len(values), 2, 2))
-        slope[:, 0, 0], slope[:, 0, 1], slope[:, 1, 1] = -(distance**3) / along, -across / along, 1.0
-        slope = np.array([[cos, -sin], [sin, cos]]) @ slope
-        return Placed(position, slope @ noise @ slope.swapaxes(-1, -2))
+        distance, angle = np.exp(values[:, 0]), values[:, 1] + at[2]
+        away = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+        slope = np.stack([away, np.stack([-away[:, 1], away[:, 0]], -1)], -1)
+        return Placed(at[:2] + away, slope @ noise @ slope.swapaxes(-1, -2))
 
     @property
     def span(self) -> Floats:
-        return np.array([(1.0 / 80.0, 1.0 / 5.0), (-20.0, 20.0)])
+        return np.array([np.log(self.reach), (-self.angle / 2, self.angle / 2)])
 
 
 def test_a_new_sensor_is_one_class() -> None:
-    sensor = Ladar(name="ladar", noise_std=(2e-4, 0.2), angle=1.5, reach=(5.0, 80.0), clutter=2.0)
+    sensor = Sonar(name="sonar", noise_std=(0.01, 0.005), angle=1.5, reach=(5.0, 80.0), clutter=2.0)
     kind = Kind(noise=(1.0, 1.0), speed=(5.0, 4.0))
     model = Traffic((sensor,), ConstantVelocity(), (kind,), unseen_density=1e-4)
     way = [np.array([[20.0 + 0.5 * t, 3.0, 5.0, 0.0], [40.0 - 0.5 * t, -4.0, -5.0, 0.0]]) for t in range(30)]
     scans = [
-        simulate_scan(model, "ladar", 0.1 * t, np.zeros(3), np.zeros(2, dtype=np.int64), x, t)[0]
+        simulate_scan(model, "sonar", 0.1 * t, np.zeros(3), np.zeros(2, dtype=np.int64), x, t)[0]
         for t, x in enumerate(way)
     ]
     frames = model.prepare(Recording(tuple(scans)))

@@ -4,8 +4,8 @@
               of its newcomers' density
     step      an object of kind k is still there with exp(-dt / lifetime_k) and moves by x' = f(x, dt) + L_k e,
               e ~ N(0, I): the latent is e, since L may be singular. Then A newcomers take the first A free slots,
-              A ~ Poisson(dt (int density sum_k share_k / lifetime_k + sum rates of places)): so the number of
-              objects is in balance where no places add to it
+              A ~ Poisson: as many as come from places, and as balance those that go where there are none, and are
+              still there
     scan      models.objects.scan_set
 
 Numbers are truncated by the free slots. Slots are labels: an object keeps its slot; a relabelling that keeps the order
@@ -100,9 +100,10 @@ def scan_set(
     detection = detect.torch(state, torch.cat([settings, hidden[..., None]], -1))[..., 0] * exists
     if scan.noise is None:
         spread = spread_formula(type(sensor), len(sensor.noise_settings))  # type: ignore[arg-type]
-        noise = torch.diag_embed(spread.torch(predicted, torch.tensor(sensor.noise_settings)).square())
+        std = spread.torch(predicted, torch.tensor(sensor.noise_settings))
+        noise = torch.diag_embed(std.square())[..., None, :, :]
     else:
-        noise = torch.from_numpy(scan.noise)
+        noise = torch.from_numpy(scan.noise)[None]
     low, high = (torch.from_numpy(v.copy()) for v in sensor.span.T)
     table = None if sensor.confusion is None else torch.tensor(sensor.confusion)
     looks = None if table is None else Looks(table[:-1], table[-1])
@@ -176,7 +177,7 @@ def step(model: Traffic, state: State, frame: ScanFrame) -> State:
     lifetime = torch.tensor([kind.lifetime for kind in model.kinds])
     stays = dist.Bernoulli(torch.exp(-dt / lifetime)[state["kind"]])
     staying = state["exists"] * pyro.sample("stays", stays.to_event(1))
-    return _enter(model, {**state, "exists": staying, "state": _moved(model, state, dt)}, dt * model.arrival_rates)
+    return _enter(model, {**state, "exists": staying, "state": _moved(model, state, dt)}, model.arrived(dt))
 
 
 def see(model: Traffic, state: State, frame: ScanFrame) -> None:

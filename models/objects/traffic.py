@@ -158,11 +158,13 @@ class Traffic:
         x0, y0, x1, y1 = self.region
         return self.unseen_density * (x1 - x0) * (y1 - y0) * np.array([[kind.share for kind in self.kinds]])
 
-    @property
-    def arrival_rates(self) -> Floats:
-        """(O, C) newcomers [1/s], from anywhere in the region and from each place, by kind."""
+    def arrived(self, seconds: float) -> Floats:
+        """(O, C) newcomers expected to be there after a time, from anywhere in the region and from each place, by kind:
+        int_0^t rate e^(-s / lifetime) ds, the rate of those from anywhere being what balances those that go."""
         share = np.array([kind.share for kind in self.kinds])
-        return np.vstack([self.unseen_numbers / self._lifetime, *(place.rate * share for place in self.places)])
+        staying = -np.expm1(-seconds / self._lifetime)
+        places = [place.rate * share * self._lifetime * staying for place in self.places]
+        return np.vstack([self.unseen_numbers * staying, *places])
 
     def newcomer(self, kind: Kind) -> tuple[Floats, Floats]:
         """Mean and standard deviation (n,) of a newcomer's state; those of position and heading are zero."""
@@ -265,7 +267,7 @@ class Traffic:
             return no_objects(len(self.names))
         position = np.array([place.position for place in self.places])
         covariance = np.array([place.std**2 * np.eye(2) for place in self.places])
-        existence = -np.expm1([-place.rate * seconds for place in self.places])
+        existence = -np.expm1(-self.arrived(seconds)[1:].sum(1))
         groups = list[Components]()
         for i, place in enumerate(self.places):
             known = () if place.heading is None else (np.array([[place.heading[0]]]), np.array([place.heading[1]]))

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pyro
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.stats import truncnorm
 from torch import Tensor
 
+from models.objects.ground import Grid
 from models.objects.motion import ConstantVelocity
 from models.objects.scan_set import FalseAlarms, ScanSet, log_sum_associations
 from models.objects.scans import Recording, Scan
@@ -285,3 +288,57 @@ def test_evidence_of_one_object_is_that_of_kalman() -> None:
     lam = 0.3 / 4e6
     expected = math.exp(-0.3) * ((1 - there) * lam + there * (0.1 * lam + 0.9 / 4e4))
     assert abs(float(seen.mean()) - expected) < 4 * float(seen.std()) / math.sqrt(len(seen))
+
+
+def test_first_objects_are_anywhere_in_the_region() -> None:
+    draws = {name: v[0] for name, v in simulate(MODEL, BLANK[:1], num=1, seed=6).items()}
+    frames, latents = observe_frames(BLANK[:1], draws)
+    found = float(terms(MODEL, latents, frames).prior["new_state_0"])
+    states, kinds = latents["new_state_0"].numpy(), latents["new_kind_0"].numpy()
+    expected = MODEL.slots * (-math.log(200.0 * 200.0) - math.log(2 * math.pi))
+    for state, kind in zip(states, kinds, strict=True):
+        rest = (KINDS[kind].speed, (0.0, KINDS[kind].yaw_rate_std), (0.0, KINDS[kind].acceleration_std))
+        expected += sum(
+            -0.5 * ((x - m) / s) ** 2 - math.log(s * math.sqrt(2 * math.pi))
+            for x, (m, s) in zip(state[3:], rest, strict=True)
+        )
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+ROAD = Grid((-100.0, -100.0), 100.0, ((0.0, 1e-4), (3e-4, 0.0)), ((20.0, 5.0), (20.0, 20.0)), outside=1e-5)
+
+
+def test_a_grid_says_where_objects_come_from_and_how_fast() -> None:
+    plots = replace(SENSORS[1], confusion=None)
+    model = Traffic((plots,), kinds=(Kind(speed=(12.0, 4.0)),), ground=ROAD, slots=10)
+    assert model.unseen_numbers.sum() == pytest.approx(4.0)
+    kind = torch.zeros(4000, 5, dtype=torch.long)
+    with quiet_doubles(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(8)
+        newcomers = Newcomers(model, torch.ones(1, 1), kind)
+        draws = newcomers.sample()
+        log_prob = newcomers.log_prob(draws) / 5
+    x, y, speed = draws[..., 0].flatten(), draws[..., 1].flatten(), draws[..., 3].flatten()
+    slow = (x > 0) & (y < 0)
+    assert bool((slow | ((x < 0) & (y > 0))).all())
+    assert abs(float(slow.double().mean()) - 0.25) < 4 * math.sqrt(0.25 * 0.75 / len(x))
+    cut = truncnorm(-np.inf, (5.0 - 12.0) / 4.0, 12.0, 4.0)
+    assert abs(float(speed[slow].mean()) - cut.mean()) < 4 * cut.std() / math.sqrt(float(slow.sum()))
+    assert float(speed[slow].std()) == pytest.approx(cut.std(), rel=0.1)
+    assert bool(log_prob.isfinite().all())
+    scan = Scan("plots", 0.0, np.array([[50.0, -50.0], [-50.0, 50.0], [50.0, 50.0], [500.0, 0.0]]), np.zeros(3))
+    unseen, flat = model.unseen(scan), Traffic((plots,), kinds=model.kinds, unseen_density=1e-4).unseen(scan)
+    ratio = unseen.weight.reshape(4, -1).sum(1) / flat.weight.reshape(4, -1).sum(1)
+    np.testing.assert_allclose(ratio, [1.0, 3.0, 0.0, 0.1])
+    means = unseen.mean.reshape(4, -1, 6)[:, 0, 3]
+    free = truncnorm(-np.inf, 2.0, 12.0, 4.0).mean()
+    np.testing.assert_allclose(means, [cut.mean(), free, free, 12.0], rtol=1e-9)
+    deviation = np.sqrt(unseen.covariance.reshape(4, -1, 6, 6)[0, 0, 3, 3])
+    assert deviation == pytest.approx(cut.std(), rel=1e-9)
+
+
+def test_grids_that_are_none_are_refused() -> None:
+    with pytest.raises(InputError, match="grid: limits is of shape"):
+        Grid((0.0, 0.0), 10.0, ((1.0, 1.0),), ((1.0,),))
+    with pytest.raises(InputError, match="cell is 0"):
+        Grid((0.0, 0.0), 0.0, ((1.0, 1.0),))

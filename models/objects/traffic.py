@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from models.formula import Formula
 from models.multi_object import Bernoullis, Components, Moved, View, no_components, no_objects
+from models.objects.ground import Ground, limited
 from models.objects.motion import ANGLES, ConstantTurn, Motion, move_formula, noise_formula
 from models.objects.perception import together
 from models.objects.scans import Recording, Scan, check_scan
@@ -34,6 +35,7 @@ from models.unroll import unroll
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 FLAT = 100.0  # a prior this many times wider than a measurement is taken for uniform: it adds 1e-4 of its information
+CELLS = 64  # along each side of the region, of what a map says of it in the program
 HEADINGS, HEADING_STD = 4, 0.5  # about which a heading that nobody measured is normal, for a uniform one [rad]
 
 
@@ -93,6 +95,7 @@ class Traffic:
     kinds: tuple[Kind, ...] = (Kind(),)
     unseen_density: float = 1e-4  # [1/m^2]
     places: tuple[Place, ...] = ()
+    ground: Ground | None = None  # where it is known, instead of unseen_density
     region: tuple[float, float, float, float] = (-100.0, -100.0, 100.0, 100.0)  # x, y to x, y [m]: of the program
     slots: int = 6  # for objects of the program
 
@@ -165,21 +168,46 @@ class Traffic:
             )
         return self._sensors[scan.sensor]
 
-    @property
-    def unseen_numbers(self) -> Floats:
-        """(1, C) objects expected in the region, by kind."""
+    def density(self, position: Floats) -> Floats:
+        """(N,) of unseen objects at positions (N, 2) [1/m^2]."""
+        return np.full(len(position), self.unseen_density) if self.ground is None else self.ground.density(position)
+
+    @cached_property
+    def cells(self) -> Floats:
+        """(Y, X) objects expected in cells of the region, in each of which their density is that of its middle."""
         x0, y0, x1, y1 = self.region
-        return self.unseen_density * (x1 - x0) * (y1 - y0) * np.array([[kind.share for kind in self.kinds]])
+        num = 1 if self.ground is None else CELLS
+        middle = (np.arange(num) + 0.5) / num
+        x, y = np.meshgrid(x0 + (x1 - x0) * middle, y0 + (y1 - y0) * middle)
+        density = self.density(np.stack([x.ravel(), y.ravel()], -1)).reshape(num, num)
+        return density * (x1 - x0) * (y1 - y0) / num**2
 
-    @property
-    def arrival_rates(self) -> Floats:
-        """(O, C) newcomers [1/s], from anywhere in the region and from each place, by kind."""
+    @cached_property
+    def unseen_numbers(self) -> Floats:
+        """(O, C) objects expected at first, anywhere in the region and, none, from each place, by kind."""
+        from_places = np.zeros((len(self.places), len(self.kinds)))
+        return np.vstack([self.cells.sum() * np.array([kind.share for kind in self.kinds]), from_places])
+
+    def arrived(self, seconds: float) -> Floats:
+        """(O, C) newcomers expected to be there after a time, from anywhere in the region and from each place, by kind:
+        int_0^t rate e^(-s / lifetime) ds, the rate of those from anywhere being what balances those that go."""
         share = np.array([kind.share for kind in self.kinds])
-        return np.vstack([self.unseen_numbers / self._lifetime, *(place.rate * share for place in self.places)])
+        staying = -np.expm1(-seconds / self._lifetime)
+        places = [place.rate * share * self._lifetime * staying for place in self.places]
+        return np.vstack([self.unseen_numbers[0] * staying, *places])
 
-    def newcomer(self, kind: Kind) -> tuple[Floats, Floats]:
-        """Mean and standard deviation (n,) of a newcomer's state; those of position and heading are zero."""
-        return _state_prior(self.motion, kind)
+    def newcomers(self, kind: Kind, position: Floats) -> tuple[Floats, Floats]:
+        """Mean and standard deviation (N, n) of the states of newcomers at positions (N, 2), where their speed may be
+        limited; those of position and heading are zero."""
+        loc, std = (np.tile(v, (len(position), 1)) for v in _state_prior(self.motion, kind))
+        if self.ground is not None:
+            limit = self.ground.speed_limit(position)
+            if "speed" in self.names:
+                entry = self.names.index("speed")
+                loc[:, entry], std[:, entry] = limited(*kind.speed, limit)
+            else:
+                std[:, 2:4] = np.minimum(std[:, 2:4], limit[:, None])
+        return loc, std
 
     def formulas(self, sensor: Sensor) -> tuple[Formula, Formula]:
         """h and p_D of a sensor: see sensor_formulas."""
@@ -267,7 +295,7 @@ class Traffic:
         )
         flat = FLAT**2 * placed.covariance
         # a density of objects, as far as a normal one of this width is flat at its middle
-        number = self.unseen_density * 2 * math.pi * np.sqrt(np.linalg.det(flat))
+        number = self.density(placed.position) * 2 * math.pi * np.sqrt(np.linalg.det(flat))
         if placed.heading is None or placed.heading_std is None:
             return self._newcomers(number, placed.position, flat)
         wide = FLAT * placed.heading_std  # the same for the density 1 / (2 pi) of each heading
@@ -279,7 +307,7 @@ class Traffic:
             return no_objects(len(self.names))
         position = np.array([place.position for place in self.places])
         covariance = np.array([place.std**2 * np.eye(2) for place in self.places])
-        existence = -np.expm1([-place.rate * seconds for place in self.places])
+        existence = -np.expm1(-self.arrived(seconds)[1:].sum(1))
         groups = list[Components]()
         for i, place in enumerate(self.places):
             known = () if place.heading is None else (np.array([[place.heading[0]]]), np.array([place.heading[1]]))
@@ -305,9 +333,9 @@ class Traffic:
         mean, spread = np.zeros((num, len(self.kinds), per, size)), np.zeros((num, len(self.kinds), per, size, size))
         weight = np.empty((num, len(self.kinds), per))
         for k, kind in enumerate(self.kinds):
-            loc, std = self.newcomer(kind)
-            mean[:, k] = loc
-            spread[:, k, :, range(size), range(size)] = np.square(std)[:, None, None]
+            loc, std = self.newcomers(kind, position)
+            mean[:, k] = loc[:, None]
+            spread[:, k, :, range(size), range(size)] = np.square(std).T[:, :, None]
             weight[:, k] = (number * kind.share / per)[:, None]
         mean[..., :2], spread[..., :2, :2] = position[:, None, None], covariance[:, None, None]
         if first and heading is not None and heading_std is not None:

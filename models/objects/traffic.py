@@ -25,6 +25,7 @@ from models.formula import Formula
 from models.multi_object import Bernoullis, Components, Moved, View, no_components, no_objects
 from models.objects.ground import Ground, limited
 from models.objects.motion import ANGLES, ConstantTurn, Motion, move_formula, noise_formula
+from models.objects.newcomers import lay_out
 from models.objects.perception import together
 from models.objects.scans import Recording, Scan, check_scan
 from models.objects.scene import ScanFrame, State, first, frames_of, in_order, see, step
@@ -150,6 +151,24 @@ class Traffic:
     def visibility(self) -> Floats:
         """(C,) of the kinds."""
         return np.array([kind.visibility for kind in self.kinds])
+
+    @cached_property
+    def _share(self) -> Floats:
+        return np.array([kind.share for kind in self.kinds])
+
+    @cached_property
+    def _anywhere(self) -> tuple[Floats, Floats]:
+        """(C, 1, n) mean and standard deviation of newcomers' states where speed has no limit."""
+        states = [_state_prior(self.motion, kind) for kind in self.kinds]
+        loc, std = (np.array(part)[:, None] for part in zip(*states, strict=True))
+        return loc, std
+
+    def _newcomer_states(self, position: Floats) -> tuple[Floats, Floats]:
+        """The same at positions (B, 2), (C, 1 or B, n)."""
+        if self.ground is None:
+            return self._anywhere
+        loc, std = (np.stack(part) for part in zip(*(self.newcomers(k, position) for k in self.kinds), strict=True))
+        return loc, std
 
     @cached_property
     def _radius(self) -> Floats:
@@ -295,7 +314,9 @@ class Traffic:
         )
         flat = FLAT**2 * placed.covariance
         # a density of objects, as far as a normal one of this width is flat at its middle
-        number = self.density(placed.position) * 2 * math.pi * np.sqrt(np.linalg.det(flat))
+        number = (
+            self.density(placed.position) * 2 * math.pi * np.sqrt(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] ** 2)
+        )
         if placed.heading is None or placed.heading_std is None:
             return self._newcomers(number, placed.position, flat)
         wide = FLAT * placed.heading_std  # the same for the density 1 / (2 pi) of each heading
@@ -324,26 +345,27 @@ class Traffic:
     ) -> Components:
         """B groups of components: every kind at every heading (B, H), with standard deviation (B,), or all around;
         weights summing to number (B,)."""
-        num, size, first = len(number), len(self.names), "heading" in self.names
-        if first and (heading is None or heading_std is None):
-            heading = np.broadcast_to(np.arange(HEADINGS) * (2 * math.pi / HEADINGS), (num, HEADINGS))
-            heading_std = np.full(num, HEADING_STD)
-        per = heading.shape[1] if first and heading is not None else 1
-        count = per * len(self.kinds)
-        mean, spread = np.zeros((num, len(self.kinds), per, size)), np.zeros((num, len(self.kinds), per, size, size))
-        weight = np.empty((num, len(self.kinds), per))
-        for k, kind in enumerate(self.kinds):
-            loc, std = self.newcomers(kind, position)
-            mean[:, k] = loc[:, None]
-            spread[:, k, :, range(size), range(size)] = np.square(std).T[:, :, None]
-            weight[:, k] = (number * kind.share / per)[:, None]
-        mean[..., :2], spread[..., :2, :2] = position[:, None, None], covariance[:, None, None]
-        if first and heading is not None and heading_std is not None:
-            entry = self.names.index("heading")
-            mean[..., entry], spread[..., entry, entry] = heading[:, None], np.square(heading_std)[:, None, None]
-        index = np.tile(np.repeat(np.arange(len(self.kinds)), per), num)
-        offset = count * np.arange(num + 1)
-        return Components(offset, weight.ravel(), index, mean.reshape(-1, size), spread.reshape(-1, size, size))
+        num = len(number)
+        if heading is None or heading_std is None:
+            heading, heading_std = (
+                np.broadcast_to(self._headings, (num, len(self._headings))),
+                np.full(num, HEADING_STD),
+            )
+        loc, std = self._newcomer_states(position)
+        return Components(
+            *lay_out(number, position, covariance, heading, heading_std, self._heading, loc, std, self._share)
+        )
+
+    @cached_property
+    def _heading(self) -> int:
+        """Which entry of the state is the heading, -1 for none."""
+        return self.names.index("heading") if "heading" in self.names else -1
+
+    @cached_property
+    def _headings(self) -> Floats:
+        """About which newcomers of unknown heading go."""
+        num = HEADINGS if self._heading >= 0 else 1
+        return np.arange(num) * (2 * math.pi / num)
 
 
 @lru_cache

@@ -21,7 +21,9 @@ from omegaconf import MISSING, BooleanNode, Container, DictConfig, IntegerNode, 
 
 from experiments.signatures import ConfigError, Knob, knobs, locate
 
-SUPPLIED = frozenset({"model", "evidence", "scene", "posterior", "posteriors", "seed"})  # by run(), to partial targets
+SUPPLIED = frozenset(  # by run(), to partial targets
+    {"model", "evidence", "scans", "scene", "posterior", "posteriors", "seed"}
+)
 
 
 class UnknownKnob(ConfigError):
@@ -114,6 +116,11 @@ def check_values(config: DictConfig) -> None:
                 raise ConfigError(f"{path}.{name} is '{node[name]}'{suggest(str(node[name]), knob.choices)}")
 
 
+def _as_tuples(value: Any) -> Any:
+    """Lists as tuples, lists inside them, too: settings are hashed."""
+    return tuple(_as_tuples(item) for item in value) if isinstance(value, list) else value
+
+
 def build(node: Any, path: str = "") -> Any:
     """Call what a resolved config node names; a partial node becomes a function awaiting the rest.
 
@@ -131,6 +138,6 @@ def build(node: Any, path: str = "") -> Any:
             raise ConfigError(f"{path}.{name} has no value; give one with {path}.{name}=...")
         if value != MISSING:
             value = build(value, f"{path}.{name}")
-            arguments[name] = tuple(value) if knob.is_tuple and isinstance(value, list) else value
+            arguments[name] = _as_tuples(value) if knob.is_tuple else value
     function = locate(node["_target_"])
     return functools.partial(function, **arguments) if node.get("_partial_", False) else function(**arguments)

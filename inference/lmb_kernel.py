@@ -14,7 +14,7 @@ from inference.association_kernel import AUTO, associate
 
 LOG_TAU = math.log(2 * math.pi)
 TOLERANCE, MAX_ITERATIONS = 1e-6, 200  # of belief propagation in large groups
-SMALL = 1e-8  # posterior components of less weight are left out before anything is computed of them
+SMALL = 1e-12  # posterior components of less weight are left out before anything is computed of them
 
 
 @njit(cache=True, error_model="numpy")

@@ -98,6 +98,7 @@ def scan_set(
     settings = torch.cat([at, torch.tensor(sensor.settings)]).expand(*exists.shape, -1)
     hidden = _hidden(model, sensor, at, kind, state, exists)
     detection = detect.torch(state, torch.cat([settings, hidden[..., None]], -1))[..., 0] * exists
+    detection = detection * torch.from_numpy(model.visibility)[kind]
     if scan.noise is None:
         spread = spread_formula(type(sensor), len(sensor.noise_settings))  # type: ignore[arg-type]
         std = spread.torch(predicted, torch.tensor(sensor.noise_settings))
@@ -189,12 +190,12 @@ def see(model: Traffic, state: State, frame: ScanFrame) -> None:
 
 def _moved(model: Traffic, state: State, dt: float) -> Tensor:
     """f(x, dt) + L e, (*B, S, n)."""
-    x, time = state["state"], torch.tensor([dt])
-    std = torch.tensor([kind.noise for kind in model.kinds])[state["kind"]]  # (*B, S, m)
-    L = noise_formula(model.motion).torch(x, torch.cat([time.expand(*std.shape[:-1], 1), std], -1))
+    x, own = state["state"], torch.from_numpy(model.step_settings)[state["kind"]]  # (*B, S, .)
+    settings = torch.cat([torch.full((*own.shape[:-1], 1), dt), own], -1)
+    L = noise_formula(model.motion).torch(x, settings)
     L = L.unflatten(-1, (len(model.names), -1))
     e = pyro.sample("noise", dist.Normal(0.0, torch.ones(model.slots, L.shape[-1])).to_event(2))
-    return move_formula(model.motion).torch(x, time) + (L @ e[..., None])[..., 0]
+    return move_formula(model.motion).torch(x, settings) + (L @ e[..., None])[..., 0]
 
 
 def _enter(model: Traffic, state: State, numbers: Floats) -> State:

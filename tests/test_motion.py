@@ -32,12 +32,18 @@ def states(motion: Motion, num: int = 20) -> Floats:
     return found
 
 
+def settings(motion: Motion, dt: float, std: Floats | None = None, rate: float = 0.0, level: float = 0.0) -> Floats:
+    """One row of what a step depends on; extras all with the same rate and level."""
+    num = len(motion.extras)
+    return np.array([[dt, *(np.ones(len(motion.noises)) if std is None else std), *[rate] * num, *[level] * num]])
+
+
 @pytest.mark.parametrize("name", MOTIONS)
 def test_machine_code_casadi_and_torch_agree(name: str) -> None:
     motion = MOTIONS[name]
     x, std = states(motion), np.linspace(0.1, 0.7, len(motion.noises))
-    there = torch.from_numpy(x)
-    for formula, p in ((move_formula(motion), [0.3]), (noise_formula(motion), [0.3, *std])):
+    there, p = torch.from_numpy(x), settings(motion, 0.3, std)[0].tolist()
+    for formula in (move_formula(motion), noise_formula(motion)):
         y = formula(x, np.array([p]))
         np.testing.assert_allclose(y, formula.torch(there, torch.tensor(p, dtype=torch.float64)).numpy(), atol=1e-12)
         np.testing.assert_allclose(y[4], np.array(formula.casadi()(x[4], p)).ravel(), atol=1e-12)
@@ -46,10 +52,10 @@ def test_machine_code_casadi_and_torch_agree(name: str) -> None:
 @pytest.mark.parametrize("name", MOTIONS)
 def test_slopes_are_those_of_torch(name: str) -> None:
     motion = MOTIONS[name]
-    x, dt, n = states(motion), torch.tensor([0.3], dtype=torch.float64), len(motion.names)
-    y, J = np.empty((len(x), n)), np.empty((len(x), n, n))
-    move_formula(motion).compiled()(x, dt.numpy()[None], y, J)
-    slopes = torch.func.vmap(torch.func.jacrev(lambda v: move_formula(motion).torch(v, dt)))(torch.from_numpy(x))
+    x, p, n = states(motion), settings(motion, 0.3, rate=0.2), len(motion.names)
+    y, J, q = np.empty((len(x), n)), np.empty((len(x), n, n)), torch.from_numpy(p[0])
+    move_formula(motion).compiled()(x, p, y, J)
+    slopes = torch.func.vmap(torch.func.jacrev(lambda v: move_formula(motion).torch(v, q)))(torch.from_numpy(x))
     np.testing.assert_allclose(J, slopes.numpy(), atol=1e-12)
 
 
@@ -62,20 +68,20 @@ def turning(state: Floats) -> Floats:
 @pytest.mark.parametrize("rate", [0.0, 1e-12, 0.05, -0.6])
 def test_turn_equals_its_differential_equation(rate: float) -> None:
     start = np.array([3.0, -2.0, 0.7, 12.0, rate, -1.5])
-    found = move_formula(ConstantTurn())(start[None], np.array([[0.4]]))[0]
+    found = move_formula(ConstantTurn())(start[None], settings(ConstantTurn(), 0.4))[0]
     exact = solve_ivp(lambda t, s: turning(s), (0.0, 0.4), start, method="RK45", rtol=1e-11, atol=1e-11).y[:, -1]
     np.testing.assert_allclose(found, exact, atol=2e-8)  # Gauss's error: 12 m/s * (.6 / s)^6 * (.4 s)^7 / 2e6
 
 
 def test_constant_turn_is_the_turn_without_acceleration() -> None:
     start = np.array([[3.0, -2.0, 0.7, 12.0, 0.3, 0.0]])
-    dt = np.array([[0.4]])
-    found = move_formula(ConstantTurn(accelerates=False))(start[:, :5], dt)
-    np.testing.assert_allclose(found, move_formula(ConstantTurn())(start, dt)[:, :5], atol=1e-14)
+    p = settings(ConstantTurn(), 0.4)  # both have three noises, and no extras
+    found = move_formula(ConstantTurn(accelerates=False))(start[:, :5], p)
+    np.testing.assert_allclose(found, move_formula(ConstantTurn())(start, p)[:, :5], atol=1e-14)
 
 
-def covariance(motion: Motion, x: Floats, dt: float, std: Floats) -> Floats:
-    found = noise_formula(motion)(x[None], np.array([[dt, *std]]))[0].reshape(len(x), -1)
+def covariance(motion: Motion, x: Floats, dt: float, std: Floats, rate: float = 0.0) -> Floats:
+    found = noise_formula(motion)(x[None], settings(motion, dt, std, rate))[0].reshape(len(x), -1)
     return np.asarray(found @ found.T)
 
 
@@ -126,5 +132,16 @@ def test_two_steps_make_the_noise_of_one() -> None:
 def test_nothing_moves_in_no_time() -> None:
     for motion in MOTIONS.values():
         x = states(motion)
-        np.testing.assert_array_equal(move_formula(motion)(x, np.zeros((1, 1))), x)
-        assert not noise_formula(motion)(x, np.array([[0.0, *np.ones(len(motion.noises))]])).any()
+        p = settings(motion, 0.0)
+        np.testing.assert_array_equal(move_formula(motion)(x, p), x)
+        assert not noise_formula(motion)(x, p).any()
+
+
+@pytest.mark.parametrize("rate", [1e-4, 0.5])
+def test_extras_are_drawn_back_to_their_level(rate: float) -> None:
+    motion, std = ConstantTurn(extras=BOX), np.array([0.8, 0.3, 0.1, 0.2, 0.4])
+    x = states(motion)[5]
+    found = move_formula(motion)(x[None], settings(motion, 0.7, std, rate, 3.0))[0]
+    np.testing.assert_allclose(found[-2:], 3.0 + (x[-2:] - 3.0) * math.exp(-0.7 * rate), rtol=1e-14)
+    exact = integrated(-rate * np.eye(2), np.diag(std[-2:]), 0.7)
+    np.testing.assert_allclose(covariance(motion, x, 0.7, std, rate)[-2:, -2:], exact, rtol=1e-9)

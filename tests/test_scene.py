@@ -18,7 +18,7 @@ from models.objects.ground import Grid
 from models.objects.motion import ConstantVelocity
 from models.objects.scan_set import FalseAlarms, ScanSet, log_sum_associations
 from models.objects.scans import Recording, Scan
-from models.objects.scene import Newcomers, ScanFrame, simulate_scan
+from models.objects.scene import Newcomers, ScanFrame, rows_of, scan_set, simulate_scan
 from models.objects.sensors import Position, Radar
 from models.objects.traffic import Kind, Place, Traffic
 from models.program import InputError, check, log_joint, quiet_doubles, simulate, terms
@@ -342,3 +342,22 @@ def test_grids_that_are_none_are_refused() -> None:
         Grid((0.0, 0.0), 10.0, ((1.0, 1.0),), ((1.0,),))
     with pytest.raises(InputError, match="cell is 0"):
         Grid((0.0, 0.0), 0.0, ((1.0, 1.0),))
+
+
+def test_looks_tell_kinds_apart() -> None:
+    """Of one object right where it was measured, kinds differ in p(looks | kind) / p(looks | false alarm) alone."""
+    state = np.array([[10.0, 10.0, 0.0, 5.0, 0.0, 0.0]])
+    scan = Scan("plots", 1.0, state[:, :2], np.zeros(3), likeness=np.array([[0.2, 1.6]]))
+    value, found = rows_of(MODEL, scan), list[float]()
+    with quiet_doubles():
+        for kind in (0, 1):
+            seen = scan_set(MODEL, scan, torch.tensor([kind]), torch.from_numpy(state), torch.ones(1))
+            found.append(float(seen.log_prob_of(value, torch.zeros(1, dtype=torch.long))))
+        seen = scan_set(MODEL, scan, torch.tensor([1]), torch.from_numpy(state), torch.ones(1))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(1)
+            draws, source = seen.sample_sources((4000,))
+    assert found[1] - found[0] == pytest.approx(math.log(1.6 / 0.2), abs=1e-12)
+    for of, share in ((0, 0.8), (-1, 0.5)):  # looks like a bicycle: the object, and false alarms
+        features = draws[(source == of) & (draws[..., 0] > 0.5)][:, -1]
+        assert abs(float((features > 1.0).double().mean()) - share) < 4 * 0.5 / math.sqrt(len(features))

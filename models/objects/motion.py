@@ -38,8 +38,7 @@ SLOW = 1e-6  # an extra that relaxes slower than this is a random walk [1/s]
 
 class Body(NamedTuple):
     """What a sensor can see of an object: position [m], velocity [m/s], heading [rad], and its box [m] where the state
-    has one; None where it has not. z is the height of its lower side, score how
-    well a detector likes it."""
+    has one; None where it has not. z is the height of its lower side, score how well a detector likes it."""
 
     x: Any
     y: Any
@@ -213,8 +212,9 @@ def noise_formula(motion: Motion) -> Formula:
         columns = [(*column, *(0.0,) * (size - own)) for column in motion.noise(x, p[0], std, ops)]
         rates = p[1 + num : 1 + num + len(motion.extras)]
         for entry, q, rate in zip(range(own, size), p[1 + len(std) : 1 + num], rates, strict=True):
-            twice = ops.fmax(2 * rate, SLOW)
-            step = q * ops.sqrt((1 - ops.exp(-twice * p[0])) / twice)
+            drawn = 2 * rate > SLOW
+            twice = ops.where(drawn, 2 * rate, 1.0)
+            step = q * ops.sqrt(ops.where(drawn, (1 - ops.exp(-twice * p[0])) / twice, p[0]))
             columns.append(tuple(step if i == entry else 0.0 for i in range(size)))
         return tuple(column[i] for i in range(size) for column in columns)
 

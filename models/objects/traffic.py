@@ -8,6 +8,10 @@
 [K15] tracks with a labeled multi-Bernoulli filter; what is said here is the model under it. Objects that no scan has
 shown yet are a Poisson process of constant density, as in Williams (2015), so that a first measurement begins a track
 with the probability that it is an object rather than a false alarm, in its own scan.
+
+Filters and program differ in one thing. To a filter the density of the unseen is the same at every scan (new ground
+comes into view as the car moves); in the program it is that of the first frame, and objects in view are soon seen:
+whoever comes later comes as others go, or from places.
 """
 
 from __future__ import annotations

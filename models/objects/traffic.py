@@ -351,10 +351,8 @@ class Traffic:
         weights summing to number (B,)."""
         num = len(number)
         if heading is None or heading_std is None:
-            heading, heading_std = (
-                np.broadcast_to(self._headings, (num, len(self._headings))),
-                np.full(num, HEADING_STD),
-            )
+            heading = np.broadcast_to(self._headings, (num, len(self._headings)))
+            heading_std = np.full(num, HEADING_STD)
         loc, std = self._newcomer_states(position)
         return Components(
             *lay_out(number, position, covariance, heading, heading_std, self._heading, loc, std, self._share)
@@ -369,7 +367,7 @@ class Traffic:
     def _headings(self) -> Floats:
         """About which newcomers of unknown heading go."""
         num = HEADINGS if self._heading >= 0 else 1
-        return np.arange(num) * (2 * math.pi / num)
+        return 2 * math.pi * np.arange(num, dtype=np.float64) / num
 
 
 @lru_cache

@@ -43,7 +43,7 @@ class Knobs(NamedTuple):
     least       components lighter than this share of their object are left out
     merge       squared Mahalanobis distance within which components are one
     most        components of an object
-    faint       objects less probable than this are left out
+    faint       objects less probable than this are left out, newcomers at a tenth of it
     max_shared  measurements that objects of a group may share for exact association; belief propagation beyond
     """
 
@@ -51,7 +51,7 @@ class Knobs(NamedTuple):
     least: float = 1e-3
     merge: float = 2.0
     most: int = 4
-    faint: float = 1e-4
+    faint: float = 1e-3
     max_shared: int = 8
 
 

@@ -14,7 +14,8 @@ from inference.association_kernel import AUTO, associate
 
 LOG_TAU = math.log(2 * math.pi)
 TOLERANCE, MAX_ITERATIONS = 1e-6, 200  # of belief propagation in large groups
-SMALL = 1e-8  # posterior components of less weight are left out before anything is computed of them
+FIRST = 0.1  # newcomers are kept at this share of `faint`: nothing can have confirmed them yet
+SMALL = 1e-12  # posterior components of less weight are left out before anything is computed of them
 
 
 @njit(cache=True, error_model="numpy")
@@ -334,7 +335,7 @@ def update(  # type: ignore[no-untyped-def]
     first_existence = np.empty(M)
     for j in range(M):
         first_existence[j] = max(1.0 - explained[j], 0.0) * rho[j] / intensity[j]
-        if first_existence[j] > faint:
+        if first_existence[j] > FIRST * faint:
             fresh[born] = j
             born += 1
         else:

@@ -21,7 +21,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -84,7 +84,7 @@ class Formula:
         """The casadi.Function (x, p) -> y."""
         return _traced(self)
 
-    @property
+    @cached_property
     def num_y(self) -> int:
         """d, the length of y."""
         return int(_traced(self).size1_out(0))

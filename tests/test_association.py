@@ -175,7 +175,7 @@ def test_belief_propagation_is_exact_without_cycles() -> None:
 
 
 def test_belief_propagation_is_close_with_cycles() -> None:
-    """Seen on these 200 tables: error .02 at the median and .15 at worst, log Z .02 and .25."""
+    """Seen on these 200 tables: error .005 at the median and .12 at worst, log Z .005 and .22."""
     rng, errors, logs = np.random.default_rng(6), [], []
     for _ in range(200):
         table = random_table(rng, *rng.integers(2, 6, 2), share=0.8)
@@ -183,8 +183,8 @@ def test_belief_propagation_is_close_with_cycles() -> None:
         assert found.num_unconverged == 0
         errors.append(error(found, truth))
         logs.append(abs(found.log_partition - truth.log_partition))
-    assert np.median(errors) < 0.03 and max(errors) < 0.2
-    assert np.median(logs) < 0.04 and max(logs) < 0.4
+    assert np.median(errors) < 0.01 and max(errors) < 0.15
+    assert np.median(logs) < 0.01 and max(logs) < 0.3
 
 
 def test_belief_propagation_counts_what_it_gave_up_on() -> None:

@@ -67,6 +67,21 @@ def test_ospa2_by_hand() -> None:
     assert whole == pytest.approx(math.sqrt(((3 + 1 + 5) / 3) ** 2 / 2 + 25 / 2))
 
 
+def test_times_when_neither_path_is_there_count_nothing_in_ospa2() -> None:
+    nan = math.nan
+    first = np.array([[[0.0, 0.0], [nan, nan], [0.0, 0.0]]])
+    second = np.array([[[0.0, 1.0], [nan, nan], [0.0, 2.0]]])
+    np.testing.assert_allclose(ospa2(first, second, cutoff=5.0, window=3), [1.0, 1.0, 1.5])
+
+
+def test_pairs_are_chosen_by_the_power_of_the_distance() -> None:
+    first = np.array([[0.0, 0.0], [2.0, 0.0]])
+    second = np.array([[2.0, 0.0], [3.9925, math.sqrt(4.1**2 - 3.9925**2)]])  # 2, 4.1 m from the first; 0, 2.2 m
+    assert ospa(first, second, cutoff=9.0) == pytest.approx(4.1 / 2)  # less than 2 + 2.2
+    assert ospa(first, second, cutoff=9.0, order=2.0) == pytest.approx(math.sqrt((2**2 + 2.2**2) / 2))
+    assert gospa(first, second, cutoff=9.0).distance == pytest.approx(math.sqrt(2**2 + 2.2**2))
+
+
 def test_swapped_identities_show_in_ospa2_only() -> None:
     truth = np.stack([np.stack([np.arange(6.0), np.full(6, y)], -1) for y in (0.0, 4.0)])
     swapped = truth.copy()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.scenarios.scene import Scene, TrafficTruth
-from experiments.tracking_metrics import counts, judge, metrics, times_of, timing
+from experiments.tracking_metrics import counts, judge, metrics, position_errors, times_of, timing
 from inference.posterior import Posterior
 from inference.tracks import Tracks
 from models.program import InputError
@@ -50,11 +50,11 @@ def test_exact_tracks_have_no_error() -> None:
 def test_scores_of_a_missed_and_a_false_object_by_hand() -> None:
     truth = two(np.arange(4.0))
     mean = exact(truth).mean.copy()
-    mean[:, 1] += np.tile([3.0, 50.0], 4)  # the first is 3 m off, the second far away
+    mean[:, 1] += np.tile([7.0, 50.0], 4)  # the first is 7 m off, the second far away
     found = scored(exact(truth, mean=mean), truth, cutoff=10.0)
-    assert found["ospa_m"] == found["ospa2_m"] == pytest.approx((3 + 10) / 2)
-    assert found["gospa_m"] == pytest.approx(math.sqrt(9 + 100))
-    assert found["gospa_localisation_m"] == found["position_error_m"] == pytest.approx(3.0)
+    assert found["ospa_m"] == found["ospa2_m"] == pytest.approx((7 + 10) / 2)
+    assert found["gospa_m"] == pytest.approx(math.sqrt(49 + 100))
+    assert found["gospa_localisation_m"] == found["position_error_m"] == pytest.approx(7.0)
     assert (found["missed"], found["false"], found["lost"]) == (1.0, 1.0, 0.5)
     assert found["label_switches"] == found["fragmentations"] == found["count_error"] == 0.0
 
@@ -122,6 +122,38 @@ def test_scans_at_one_time_are_judged_each() -> None:
     mean[2:4, 0] = 2.0
     found = judge(replace(twice, mean=mean), truth, cutoff=10.0)
     np.testing.assert_array_equal(found.ospa, 0.0)
+    np.testing.assert_array_equal(found.ospa2, 0.0)
+
+
+def test_a_truth_that_knows_more_times_is_read_at_those_of_the_scans() -> None:
+    truth = traffic()
+    tracks = exact(truth)
+    rows = np.isin(tracks.scan, [2, 10, 19])
+    parts = {name: getattr(tracks, name)[rows] for name in ("label", "existence", "mean", "covariance", "kind")}
+    some = replace(
+        tracks,
+        time=truth.time[[2, 10, 19]],
+        offset=np.array([0, 2, 5, 7]),
+        sensor=("radar",) * 3,
+        draws={},
+        **parts,
+    )
+    found = judge(some, truth, cutoff=10.0)
+    assert found.true_count.tolist() == [2, 3, 2]
+    np.testing.assert_array_equal(found.ospa2, 0.0)
+    np.testing.assert_array_equal(truth.label[found.pairs[:, 0]], some.label[found.pairs[:, 1]])
+
+
+def test_errors_are_weighed_by_the_whole_covariance() -> None:
+    truth = two(np.arange(2.0))
+    tracks = exact(truth)
+    mean, covariance = tracks.mean.copy(), tracks.covariance.copy()
+    mean[0, :2] += [1.0, 1.0]
+    covariance[:, :2, :2] = [[2.0, 1.0], [1.0, 1.0]]  # inverse [[1, -1], [-1, 2]]
+    found = replace(tracks, mean=mean, covariance=covariance)
+    error, nees = position_errors(found, truth, np.array([[0, 0], [1, 1]]))
+    np.testing.assert_allclose(error, [math.sqrt(2.0), 0.0])
+    np.testing.assert_allclose(nees, [1.0, 0.0], atol=1e-12)
 
 
 def test_nobody_there_is_no_error_and_nobody_seen_is_all() -> None:

@@ -14,6 +14,7 @@ import pytest
 from experiments import store
 from experiments.run import Job, run, write
 from experiments.scenarios.scene import Scene
+from experiments.tracking_figures import figures
 from experiments.tracking_metrics import counts, metrics
 from inference.posterior import Posterior
 from inference.tracks import ARRAYS, Tracks, rows_by_label
@@ -196,9 +197,15 @@ class Blind:
 def test_tracks_pass_through_a_run_and_its_report(tmp_path: Path) -> None:
     truth = traffic()
     tracks = believed(truth)
-    functionals = [partial(counts, scans=3)]
     scene = Scene([1.0], truth, "drawn", {"seed": 0})
-    result = run(lambda: scene, Blind(), lambda *_, seed: tracks, functionals=functionals, metrics=[metrics])
+    result = run(
+        lambda: scene,
+        Blind(),
+        lambda *_, seed: tracks,
+        functionals=[partial(counts, scans=3)],
+        metrics=[metrics],
+        figures=[partial(figures, frames=2)],
+    )
     assert not result.failures
     assert set(result.diagnostics) == {"count[0]", "count[10]", "count[19]"}
     assert result.flags == []
@@ -209,6 +216,7 @@ def test_tracks_pass_through_a_run_and_its_report(tmp_path: Path) -> None:
     report = (tmp_path / "run" / "report.html").read_text()
     assert "Tracks found" in report
     assert "OSPA(2) distance of the paths in a window" in report
+    assert "data:image/gif" in report
     np.testing.assert_array_equal(Tracks.load(tmp_path / "run").mean, tracks.mean)
 
 

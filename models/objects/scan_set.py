@@ -54,7 +54,7 @@ class ScanSet(TorchDistribution):
     present hold anything.
 
     predicted    (*B, S, d) h(x)
-    noise        (*B, S, d, d) covariances, or (K, d, d) of each measurement, K = M or 1
+    noise        (*B, S, K, d, d) covariances of an object's measurement as each of them; S and K may be 1
     detection    (*B, S), zero where no object is
     kind         (*B, S)
     clutter      intensity (*, M) of measurements (*, M, d)
@@ -86,11 +86,10 @@ class ScanSet(TorchDistribution):
         super().__init__(detection.shape[:-1], torch.Size([self.rows, 1 + predicted.shape[-1] + num_kinds]))
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> ScanSet:
-        own, fixed = self.predicted.shape[-2:], self.noise.dim() == 3
-        noise = self.noise if fixed else self.noise.expand(*batch_shape, *own, own[-1])
+        own = self.predicted.shape[-2:]
         return ScanSet(
             self.predicted.expand(*batch_shape, *own),
-            noise,
+            self.noise.expand(*batch_shape, *self.noise.shape[-4:]),
             self.detection.expand(*batch_shape, own[0]),
             self.kind.expand(*batch_shape, own[0]),
             *(self.false_alarms, self.clutter, self.period, self.num_kinds, self.looks, self.rows),
@@ -104,8 +103,7 @@ class ScanSet(TorchDistribution):
         shape = torch.Size(sample_shape) + self.detection.shape[:-1]
         num, d = self.num_objects, self.predicted.shape[-1]
         seen = torch.rand(*shape, num) < self.detection
-        noise = self.noise[0] if self.noise.dim() == 3 else self.noise
-        error = torch.linalg.cholesky(noise) @ torch.randn(*shape, num, d, 1)
+        error = torch.linalg.cholesky(self.noise[..., 0, :, :]) @ torch.randn(*shape, num, d, 1)
         measured = self.predicted + error[..., 0]
         alarms = capacity(num, self.false_alarms.expected) - num
         count = torch.poisson(torch.full(shape, self.false_alarms.expected)).clamp(max=alarms)
@@ -135,8 +133,7 @@ class ScanSet(TorchDistribution):
         and of measurements that are false alarms (*B, M)."""
         present, z, feature = value[..., 0] > 0.5, value[..., 1 : 1 + len(self.period)], value[..., -self.num_kinds :]
         residual = wrapped(z[..., None, :, :] - self.predicted[..., :, None, :], self.period)  # (*B, S, M, d)
-        noise = self.noise if self.noise.dim() == 3 else self.noise[..., None, :, :]
-        factor = torch.linalg.cholesky(noise)
+        factor = torch.linalg.cholesky(self.noise)
         white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]
         log_volume = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * z.shape[-1] * math.log(2 * math.pi)
         kind = self.kind[..., None].expand(*residual.shape[:-1])

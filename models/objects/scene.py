@@ -4,8 +4,8 @@
               of its newcomers' density
     step      an object of kind k is still there with exp(-dt / lifetime_k) and moves by x' = f(x, dt) + L_k e,
               e ~ N(0, I): the latent is e, since L may be singular. Then A newcomers take the first A free slots,
-              A ~ Poisson(dt (int density sum_k share_k / lifetime_k + sum rates of places)): so the number of
-              objects is in balance where no places add to it
+              A ~ Poisson: as many as come from places, and as balance those that go where there are none, and are
+              still there
     scan      models.objects.scan_set
 
 Numbers are truncated by the free slots. Slots are labels: an object keeps its slot; a relabelling that keeps the order
@@ -98,11 +98,13 @@ def scan_set(
     settings = torch.cat([at, torch.tensor(sensor.settings)]).expand(*exists.shape, -1)
     hidden = _hidden(model, sensor, at, kind, state, exists)
     detection = detect.torch(state, torch.cat([settings, hidden[..., None]], -1))[..., 0] * exists
+    detection = detection * torch.from_numpy(model.visibility)[kind]
     if scan.noise is None:
         spread = spread_formula(type(sensor), len(sensor.noise_settings))  # type: ignore[arg-type]
-        noise = torch.diag_embed(spread.torch(predicted, torch.tensor(sensor.noise_settings)).square())
+        std = spread.torch(predicted, torch.tensor(sensor.noise_settings))
+        noise = torch.diag_embed(std.square())[..., None, :, :]
     else:
-        noise = torch.from_numpy(scan.noise)
+        noise = torch.from_numpy(scan.noise)[None]
     low, high = (torch.from_numpy(v.copy()) for v in sensor.span.T)
     table = None if sensor.confusion is None else torch.tensor(sensor.confusion)
     looks = None if table is None else Looks(table[:-1], table[-1])
@@ -176,7 +178,7 @@ def step(model: Traffic, state: State, frame: ScanFrame) -> State:
     lifetime = torch.tensor([kind.lifetime for kind in model.kinds])
     stays = dist.Bernoulli(torch.exp(-dt / lifetime)[state["kind"]])
     staying = state["exists"] * pyro.sample("stays", stays.to_event(1))
-    return _enter(model, {**state, "exists": staying, "state": _moved(model, state, dt)}, dt * model.arrival_rates)
+    return _enter(model, {**state, "exists": staying, "state": _moved(model, state, dt)}, model.arrived(dt))
 
 
 def see(model: Traffic, state: State, frame: ScanFrame) -> None:
@@ -188,12 +190,12 @@ def see(model: Traffic, state: State, frame: ScanFrame) -> None:
 
 def _moved(model: Traffic, state: State, dt: float) -> Tensor:
     """f(x, dt) + L e, (*B, S, n)."""
-    x, time = state["state"], torch.tensor([dt])
-    std = torch.tensor([kind.noise for kind in model.kinds])[state["kind"]]  # (*B, S, m)
-    L = noise_formula(model.motion).torch(x, torch.cat([time.expand(*std.shape[:-1], 1), std], -1))
+    x, own = state["state"], torch.from_numpy(model.step_settings)[state["kind"]]  # (*B, S, .)
+    settings = torch.cat([torch.full((*own.shape[:-1], 1), dt), own], -1)
+    L = noise_formula(model.motion).torch(x, settings)
     L = L.unflatten(-1, (len(model.names), -1))
     e = pyro.sample("noise", dist.Normal(0.0, torch.ones(model.slots, L.shape[-1])).to_event(2))
-    return move_formula(model.motion).torch(x, time) + (L @ e[..., None])[..., 0]
+    return move_formula(model.motion).torch(x, settings) + (L @ e[..., None])[..., 0]
 
 
 def _enter(model: Traffic, state: State, numbers: Floats) -> State:
@@ -205,7 +207,7 @@ def _enter(model: Traffic, state: State, numbers: Floats) -> State:
     room = count <= free.sum(-1, keepdim=True)
     born = pyro.sample("born", dist.Categorical(logits=torch.where(room, poisson, -torch.inf)))
     new = (free > 0.5) & (free.cumsum(-1) <= born[..., None])
-    share = model.unseen_numbers if numbers.sum() == 0.0 else numbers
+    share = numbers if numbers.sum() > 0.0 else np.ones_like(numbers)  # of draws that nobody uses
     of_kind = torch.from_numpy(share.sum(0) / share.sum()).expand(model.slots, -1)
     kind = pyro.sample("new_kind", dist.Categorical(of_kind).to_event(1))
     fresh = pyro.sample("new_state", Newcomers(model, torch.from_numpy(share / share.sum(0)), kind))
@@ -219,8 +221,8 @@ def _enter(model: Traffic, state: State, numbers: Floats) -> State:
 
 
 class Newcomers(TorchDistribution):
-    """States (S, n) of newcomers of kinds (*B, S), that come from anywhere (origin 0: uniform over the region) or from
-    a place (1, 2, ...: normal about it), origins having probability (O, C) given the kind.
+    """States (S, n) of newcomers of kinds (*B, S), that come from anywhere (origin 0: as their density has it over the
+    region) or from a place (1, 2, ...: normal about it), origins having probability (O, C) given the kind.
 
     What is not position is normal by kind; a heading is uniform, and its density that of an angle modulo 2 pi, unless
     its place knows it."""
@@ -235,45 +237,59 @@ class Newcomers(TorchDistribution):
     def expand(self, batch_shape: Any, _instance: Any = None) -> Newcomers:
         return Newcomers(self.model, self.origin, self.kind.expand(*batch_shape, self.kind.shape[-1]))
 
+    def _rest(self, position: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (*, n) of what is not position, there (*, 2), and of a kind (*)."""
+        flat = position.detach().reshape(-1, 2).numpy()
+        by_kind = [self.model.newcomers(k, flat) for k in self.model.kinds]
+        row, which = torch.arange(len(flat)), kind.expand(position.shape[:-1]).reshape(-1)
+        parts = (torch.from_numpy(np.stack(part))[which, row] for part in zip(*by_kind, strict=True))
+        loc, std = (part.reshape(*position.shape[:-1], -1) for part in parts)
+        return loc, std
+
     @property
-    def _tables(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation (C, n) by kind."""
-        found = [self.model.newcomer(kind) for kind in self.model.kinds]
-        return torch.tensor(np.array([loc for loc, _ in found])), torch.tensor(np.array([std for _, std in found]))
+    def _anywhere(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The cells' probabilities (Y, X), the corner of the region (2,) and the sides of a cell (2,)."""
+        x0, y0, x1, y1 = self.model.region
+        cells = torch.from_numpy(self.model.cells)
+        some = cells if bool(cells.sum() > 0.0) else torch.ones_like(cells)
+        return some / some.sum(), torch.tensor([x0, y0]), torch.tensor([x1 - x0, y1 - y0]) / len(cells)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.kind.shape
         kind = self.kind.expand(shape)
-        loc, std = self._tables
-        state = loc[kind] + std[kind] * torch.randn(*shape, len(self.model.names))
         origin = dist.Categorical(self.origin.T[kind]).sample()
-        x0, y0, x1, y1 = self.model.region
-        anywhere = torch.tensor([x0, y0]) + torch.tensor([x1 - x0, y1 - y0]) * torch.rand(*shape, 2)
-        state[..., :2] = anywhere
-        turn = 2 * math.pi * torch.rand(shape) - math.pi
-        heading = self.model.names.index("heading") if "heading" in self.model.names else None
-        if heading is not None:
-            state[..., heading] = turn
+        cells, corner, side = self._anywhere
+        cell = dist.Categorical(cells.flatten()).sample(shape)
+        position = corner + side * (torch.stack([cell % len(cells), cell // len(cells)], -1) + torch.rand(*shape, 2))
         for number, place in enumerate(self.model.places, start=1):
-            here = origin == number
             near = torch.tensor(place.position) + place.std * torch.randn(*shape, 2)
-            state[..., :2] = torch.where(here[..., None], near, state[..., :2])
-            if heading is not None and place.heading is not None:
+            position = torch.where((origin == number)[..., None], near, position)
+        loc, std = self._rest(position, kind)
+        state = loc + std * torch.randn(*shape, len(self.model.names))
+        state[..., :2] = position
+        heading = self.model.names.index("heading") if "heading" in self.model.names else None
+        if heading is None:
+            return state
+        state[..., heading] = 2 * math.pi * torch.rand(shape) - math.pi
+        for number, place in enumerate(self.model.places, start=1):
+            if place.heading is not None:
                 known = place.heading[0] + place.heading[1] * torch.randn(shape)
-                state[..., heading] = torch.where(here, known, state[..., heading])
+                state[..., heading] = torch.where(origin == number, known, state[..., heading])
         return state
 
     def log_prob(self, value: Tensor) -> Tensor:
-        loc, std = self._tables
         names, position = self.model.names, value[..., :2]
+        loc, std = self._rest(position, self.kind)
         rest = [i for i in range(2, len(names)) if names[i] != "heading"]
-        others = dist.Normal(loc[self.kind][..., rest], std[self.kind][..., rest]).log_prob(value[..., rest]).sum(-1)
-        x0, y0, x1, y1 = self.model.region
-        low, high = torch.tensor([x0, y0]), torch.tensor([x1, y1])
-        inside = ((position >= low) & (position <= high)).all(-1)
+        others = dist.Normal(loc[..., rest], std[..., rest]).log_prob(value[..., rest]).sum(-1)
+        cells, corner, side = self._anywhere
+        cell = torch.floor((position - corner) / side)
+        inside = ((cell >= 0) & (cell < len(cells))).all(-1)
+        column, row = cell.clamp(0, len(cells) - 1).long().unbind(-1)
+        anywhere = torch.where(inside, cells[row, column], 0.0).log() - side.log().sum()
         heading = value[..., names.index("heading")] if "heading" in names else None
         turn = 0.0 if heading is None else -math.log(2 * math.pi)
-        parts = [torch.where(inside, turn - (high - low).log().sum(), -torch.inf)]
+        parts = [turn + anywhere]
         for place in self.model.places:
             near = dist.Normal(torch.tensor(place.position), place.std).log_prob(position).sum(-1)
             if heading is None or place.heading is None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -103,7 +103,7 @@ class Sensor:
                     "one for each kind and one, without zeros, for false alarms"
                 )
 
-    @property
+    @cached_property
     def period(self) -> Floats:
         """(d,) of angles, inf else."""
         return np.array([ANGLES.get(name, math.inf) for name in self.names])
@@ -163,7 +163,11 @@ class Sensor:
 
     def clutter_intensity(self, values: Floats) -> Floats:
         """lambda_c (*, M) of values (*, M, d): uniform over the span; the same beyond it, where noise may lead."""
-        return np.full(values.shape[:-1], self.clutter / np.prod(self.span[:, 1] - self.span[:, 0]))
+        return np.full(values.shape[:-1], self._clutter_density)
+
+    @cached_property
+    def _clutter_density(self) -> float:
+        return self.clutter / float(np.prod(self.span[:, 1] - self.span[:, 0]))
 
     def feature(self, scan: Scan, num_kinds: int) -> Floats:
         """(M, C) p(score, looks | kind) / p(score, looks | false alarm). A score s that is the probability to be no
@@ -268,8 +272,9 @@ class RangeBearing(Sensor):
     def place(self, values: Floats, noise: Floats, at: Floats) -> Placed:
         distance, angle = values[:, 0], values[:, 1] + at[2]
         cos, sin = np.cos(angle), np.sin(angle)
-        slope = np.stack([np.stack([cos, -distance * sin], -1), np.stack([sin, distance * cos], -1)], -2)
-        position = np.stack([at[0] + distance * cos, at[1] + distance * sin], -1)
+        slope, position = np.empty((len(values), 2, 2)), np.empty((len(values), 2))
+        slope[:, 0, 0], slope[:, 0, 1], slope[:, 1, 0], slope[:, 1, 1] = cos, -distance * sin, sin, distance * cos
+        position[:, 0], position[:, 1] = at[0] + distance * cos, at[1] + distance * sin
         return Placed(position, slope @ noise[:, :2, :2] @ slope.swapaxes(-1, -2))
 
     @property

@@ -8,6 +8,10 @@
 [K15] tracks with a labeled multi-Bernoulli filter; what is said here is the model under it. Objects that no scan has
 shown yet are a Poisson process of constant density, as in Williams (2015), so that a first measurement begins a track
 with the probability that it is an object rather than a false alarm, in its own scan.
+
+Filters and program differ in one thing. To a filter the density of the unseen is the same at every scan (new ground
+comes into view as the car moves); in the program it is that of the first frame, and objects in view are soon seen:
+whoever comes later comes as others go, or from places.
 """
 
 from __future__ import annotations
@@ -23,7 +27,9 @@ from numpy.typing import NDArray
 
 from models.formula import Formula
 from models.multi_object import Bernoullis, Components, Moved, View, no_components, no_objects
+from models.objects.ground import Ground, limited
 from models.objects.motion import ANGLES, ConstantTurn, Motion, move_formula, noise_formula
+from models.objects.newcomers import lay_out
 from models.objects.perception import together
 from models.objects.scans import Recording, Scan, check_scan
 from models.objects.scene import ScanFrame, State, first, frames_of, in_order, see, step
@@ -34,6 +40,7 @@ from models.unroll import unroll
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 FLAT = 100.0  # a prior this many times wider than a measurement is taken for uniform: it adds 1e-4 of its information
+CELLS = 64  # along each side of the region, of what a map says of it in the program
 HEADINGS, HEADING_STD = 4, 0.5  # about which a heading that nobody measured is normal, for a uniform one [rad]
 
 
@@ -47,6 +54,9 @@ class Kind:
     speed         mean and standard deviation [m/s] when first seen
     yaw_rate_std, acceleration_std  when first seen [rad/s], [m/s^2]
     extras        (mean, standard deviation) of the motion's extras when first seen
+    rates         at which extras go back to their mean [1/s]: with noise q and rate r their standard deviation tends to
+                  q / sqrt(2 r); none for random walks
+    visibility    factor to every sensor's probability to detect it
     radius        of the disc that hides what is behind it [m]
     """
 
@@ -58,10 +68,13 @@ class Kind:
     yaw_rate_std: float = 0.2
     acceleration_std: float = 0.5
     extras: tuple[tuple[float, float], ...] = ()
+    rates: tuple[float, ...] = ()
+    visibility: float = 1.0
     radius: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "extras", tuple(tuple(pair) for pair in self.extras))  # configs have lists
+        object.__setattr__(self, "rates", tuple(self.rates) or (0.0,) * len(self.extras))
         for what in ("share", "lifetime", "radius"):
             if not 0.0 < getattr(self, what) < math.inf:
                 raise InputError(f"kind {self.name}: {what} is {getattr(self, what)}; give a positive number")
@@ -87,6 +100,7 @@ class Traffic:
     kinds: tuple[Kind, ...] = (Kind(),)
     unseen_density: float = 1e-4  # [1/m^2]
     places: tuple[Place, ...] = ()
+    ground: Ground | None = None  # where it is known, instead of unseen_density
     region: tuple[float, float, float, float] = (-100.0, -100.0, 100.0, 100.0)  # x, y to x, y [m]: of the program
     slots: int = 6  # for objects of the program
 
@@ -132,8 +146,33 @@ class Traffic:
         return {sensor.name: sensor for sensor in self.sensors}
 
     @cached_property
-    def _noise(self) -> Floats:
-        return np.array([kind.noise for kind in self.kinds])
+    def step_settings(self) -> Floats:
+        """(C, .) what a step depends on but its time, of each kind: noises, rates and levels of the extras."""
+        levels = [[mean for mean, _ in kind.extras] for kind in self.kinds]
+        return np.array([(*k.noise, *k.rates, *m) for k, m in zip(self.kinds, levels, strict=True)])
+
+    @cached_property
+    def visibility(self) -> Floats:
+        """(C,) of the kinds."""
+        return np.array([kind.visibility for kind in self.kinds])
+
+    @cached_property
+    def _share(self) -> Floats:
+        return np.array([kind.share for kind in self.kinds])
+
+    @cached_property
+    def _anywhere(self) -> tuple[Floats, Floats]:
+        """(C, 1, n) mean and standard deviation of newcomers' states where speed has no limit."""
+        states = [_state_prior(self.motion, kind) for kind in self.kinds]
+        loc, std = (np.array(part)[:, None] for part in zip(*states, strict=True))
+        return loc, std
+
+    def _newcomer_states(self, position: Floats) -> tuple[Floats, Floats]:
+        """The same at positions (B, 2), (C, 1 or B, n)."""
+        if self.ground is None:
+            return self._anywhere
+        loc, std = (np.stack(part) for part in zip(*(self.newcomers(k, position) for k in self.kinds), strict=True))
+        return loc, std
 
     @cached_property
     def _radius(self) -> Floats:
@@ -152,21 +191,46 @@ class Traffic:
             )
         return self._sensors[scan.sensor]
 
-    @property
-    def unseen_numbers(self) -> Floats:
-        """(1, C) objects expected in the region, by kind."""
+    def density(self, position: Floats) -> Floats:
+        """(N,) of unseen objects at positions (N, 2) [1/m^2]."""
+        return np.full(len(position), self.unseen_density) if self.ground is None else self.ground.density(position)
+
+    @cached_property
+    def cells(self) -> Floats:
+        """(Y, X) objects expected in cells of the region, in each of which their density is that of its middle."""
         x0, y0, x1, y1 = self.region
-        return self.unseen_density * (x1 - x0) * (y1 - y0) * np.array([[kind.share for kind in self.kinds]])
+        num = 1 if self.ground is None else CELLS
+        middle = (np.arange(num) + 0.5) / num
+        x, y = np.meshgrid(x0 + (x1 - x0) * middle, y0 + (y1 - y0) * middle)
+        density = self.density(np.stack([x.ravel(), y.ravel()], -1)).reshape(num, num)
+        return density * (x1 - x0) * (y1 - y0) / num**2
 
-    @property
-    def arrival_rates(self) -> Floats:
-        """(O, C) newcomers [1/s], from anywhere in the region and from each place, by kind."""
+    @cached_property
+    def unseen_numbers(self) -> Floats:
+        """(O, C) objects expected at first, anywhere in the region and, none, from each place, by kind."""
+        from_places = np.zeros((len(self.places), len(self.kinds)))
+        return np.vstack([self.cells.sum() * np.array([kind.share for kind in self.kinds]), from_places])
+
+    def arrived(self, seconds: float) -> Floats:
+        """(O, C) newcomers expected to be there after a time, from anywhere in the region and from each place, by kind:
+        int_0^t rate e^(-s / lifetime) ds, the rate of those from anywhere being what balances those that go."""
         share = np.array([kind.share for kind in self.kinds])
-        return np.vstack([self.unseen_numbers / self._lifetime, *(place.rate * share for place in self.places)])
+        staying = -np.expm1(-seconds / self._lifetime)
+        places = [place.rate * share * self._lifetime * staying for place in self.places]
+        return np.vstack([self.unseen_numbers[0] * staying, *places])
 
-    def newcomer(self, kind: Kind) -> tuple[Floats, Floats]:
-        """Mean and standard deviation (n,) of a newcomer's state; those of position and heading are zero."""
-        return _state_prior(self.motion, kind)
+    def newcomers(self, kind: Kind, position: Floats) -> tuple[Floats, Floats]:
+        """Mean and standard deviation (N, n) of the states of newcomers at positions (N, 2), where their speed may be
+        limited; those of position and heading are zero."""
+        loc, std = (np.tile(v, (len(position), 1)) for v in _state_prior(self.motion, kind))
+        if self.ground is not None:
+            limit = self.ground.speed_limit(position)
+            if "speed" in self.names:
+                entry = self.names.index("speed")
+                loc[:, entry], std[:, entry] = limited(*kind.speed, limit)
+            else:
+                std[:, 2:4] = np.minimum(std[:, 2:4], limit[:, None])
+        return loc, std
 
     def formulas(self, sensor: Sensor) -> tuple[Formula, Formula]:
         """h and p_D of a sensor: see sensor_formulas."""
@@ -201,10 +265,10 @@ class Traffic:
     def move(self, kind: Ints, mean: Floats, seconds: float) -> Moved:
         size, num = len(self.names), len(kind)
         moved, slope = np.empty((num, size)), np.empty((num, size, size))
-        move_formula(self.motion).compiled()(mean, np.full((1, 1), seconds), moved, slope)
         noise = np.empty((num, noise_formula(self.motion).num_y))
-        settings = np.empty((num, 1 + self._noise.shape[1]))
-        settings[:, 0], settings[:, 1:] = seconds, self._noise[kind]
+        settings = np.empty((num, 1 + self.step_settings.shape[1]))
+        settings[:, 0], settings[:, 1:] = seconds, self.step_settings[kind]
+        move_formula(self.motion).compiled()(mean, settings, moved, slope)
         noise_formula(self.motion).compiled(jacobian=False)(mean, settings, noise)
         return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self._lifetime[kind]))
 
@@ -224,7 +288,8 @@ class Traffic:
         one = len(noise) == 1
         sort = np.zeros(len(values), dtype=np.int64) if one else np.arange(len(values))
         clutter, feature = sensor.clutter_intensity(values), sensor.feature(scan, len(self.kinds))
-        return View(predicted, slope, detection[:, 0], values, noise, sort, clutter, feature, sensor.period)
+        detection = detection[:, 0] * self.visibility[np.concatenate([objects.components.kind, more.kind])]
+        return View(predicted, slope, detection, values, noise, sort, clutter, feature, sensor.period)
 
     def _hidden(self, sensor: Sensor, at: Floats, objects: Bernoullis, more: Components) -> Floats:
         """(N,) mass of being hidden, of the components of objects, behind others, and of more, behind any; (1,) where
@@ -253,7 +318,9 @@ class Traffic:
         )
         flat = FLAT**2 * placed.covariance
         # a density of objects, as far as a normal one of this width is flat at its middle
-        number = self.unseen_density * 2 * math.pi * np.sqrt(np.linalg.det(flat))
+        number = (
+            self.density(placed.position) * 2 * math.pi * np.sqrt(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] ** 2)
+        )
         if placed.heading is None or placed.heading_std is None:
             return self._newcomers(number, placed.position, flat)
         wide = FLAT * placed.heading_std  # the same for the density 1 / (2 pi) of each heading
@@ -265,7 +332,7 @@ class Traffic:
             return no_objects(len(self.names))
         position = np.array([place.position for place in self.places])
         covariance = np.array([place.std**2 * np.eye(2) for place in self.places])
-        existence = -np.expm1([-place.rate * seconds for place in self.places])
+        existence = -np.expm1(-self.arrived(seconds)[1:].sum(1))
         groups = list[Components]()
         for i, place in enumerate(self.places):
             known = () if place.heading is None else (np.array([[place.heading[0]]]), np.array([place.heading[1]]))
@@ -282,26 +349,25 @@ class Traffic:
     ) -> Components:
         """B groups of components: every kind at every heading (B, H), with standard deviation (B,), or all around;
         weights summing to number (B,)."""
-        num, size, first = len(number), len(self.names), "heading" in self.names
-        if first and (heading is None or heading_std is None):
-            heading = np.broadcast_to(np.arange(HEADINGS) * (2 * math.pi / HEADINGS), (num, HEADINGS))
+        num = len(number)
+        if heading is None or heading_std is None:
+            heading = np.broadcast_to(self._headings, (num, len(self._headings)))
             heading_std = np.full(num, HEADING_STD)
-        per = heading.shape[1] if first and heading is not None else 1
-        count = per * len(self.kinds)
-        mean, spread = np.zeros((num, len(self.kinds), per, size)), np.zeros((num, len(self.kinds), per, size, size))
-        weight = np.empty((num, len(self.kinds), per))
-        for k, kind in enumerate(self.kinds):
-            loc, std = self.newcomer(kind)
-            mean[:, k] = loc
-            spread[:, k, :, range(size), range(size)] = np.square(std)[:, None, None]
-            weight[:, k] = (number * kind.share / per)[:, None]
-        mean[..., :2], spread[..., :2, :2] = position[:, None, None], covariance[:, None, None]
-        if first and heading is not None and heading_std is not None:
-            entry = self.names.index("heading")
-            mean[..., entry], spread[..., entry, entry] = heading[:, None], np.square(heading_std)[:, None, None]
-        index = np.tile(np.repeat(np.arange(len(self.kinds)), per), num)
-        offset = count * np.arange(num + 1)
-        return Components(offset, weight.ravel(), index, mean.reshape(-1, size), spread.reshape(-1, size, size))
+        loc, std = self._newcomer_states(position)
+        return Components(
+            *lay_out(number, position, covariance, heading, heading_std, self._heading, loc, std, self._share)
+        )
+
+    @cached_property
+    def _heading(self) -> int:
+        """Which entry of the state is the heading, -1 for none."""
+        return self.names.index("heading") if "heading" in self.names else -1
+
+    @cached_property
+    def _headings(self) -> Floats:
+        """About which newcomers of unknown heading go."""
+        num = HEADINGS if self._heading >= 0 else 1
+        return 2 * math.pi * np.arange(num, dtype=np.float64) / num
 
 
 @lru_cache

@@ -40,9 +40,9 @@ class Knobs(NamedTuple):
     """Settings of the approximations.
 
     gate        squared Mahalanobis distance beyond which a measurement is not of a component
-    least       components lighter than this share of their object are left out
+    least       components lighter than this share of their object are left out, but for the heaviest of each kind
     merge       squared Mahalanobis distance within which components are one
-    most        components of an object
+    most        components of each kind of an object
     faint       objects less probable than this are left out, newcomers at a tenth of it
     max_shared  measurements that objects of a group may share for exact association; belief propagation beyond
     """

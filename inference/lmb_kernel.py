@@ -144,7 +144,8 @@ def reduce(count, w, kind, mean, P, period, least, merge, most, first, out_w, ou
     """Reduce a mixture of `count` components to few, written from `first` on, weights summing to one; how many.
 
     The heaviest takes in all of its kind within `merge` of it (squared Mahalanobis distance, its own covariance), by
-    moments; and so on with the rest, until `most` are there or what is left is lighter than `least` of all."""
+    moments; and so on with the rest, until `most` are there or what is left is lighter than `least` of all. Of what has
+    weight at all, something is kept."""
     n = mean.shape[1]
     C, difference, y, centre = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
     total = 0.0
@@ -152,7 +153,7 @@ def reduce(count, w, kind, mean, P, period, least, merge, most, first, out_w, ou
         total += w[i]
     made, kept = 0, 0.0
     while made < most:
-        heaviest, most_weight = -1, least * total
+        heaviest, most_weight = -1, least * total if made else 0.0
         for i in range(count):
             if w[i] > most_weight:
                 heaviest, most_weight = i, w[i]
@@ -369,7 +370,7 @@ def update(  # type: ignore[no-untyped-def]
                 w[have], k[have] = value, kind[c]
                 condition(mean[c], P[c], gains[pair_gain[p]], pair_y[p], m[have], V[have])
                 have += 1
-        if not total > faint:
+        if have == 0 or not total > faint:
             left_out += total
             continue
         at += reduce(have, w, k, m, V, state_period, least, merge, most, at, out_w, out_kind, out_mean, out_P)

@@ -105,8 +105,12 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     label = np.empty(len(source), dtype=np.int64)
     label[~born] = objects.label[source[~born]]
     label[born] = number * STRIDE - 1 - source[born]
-    if not np.isfinite(existence).all() or not math.isfinite(log_factor):
-        raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
+    finite = all(math.isfinite(part.sum()) for part in (existence, *parts)) and math.isfinite(log_factor + left_out)
+    if not finite or parts[-1].diagonal(0, 1, 2).min(initial=0.0) < 0.0:
+        raise FloatingPointError(
+            f"the update by sensor '{scan.sensor}' at {scan.time} s made a number that is not finite, or a negative "
+            "variance; look for noises, speeds or gaps between scans that are far too large"
+        )
     posterior = Bernoullis(label, existence, Components(*parts))
     return Belief(scan.time, posterior), Facts(log_factor, int(loopy), float(left_out))
 

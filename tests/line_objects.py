@@ -143,9 +143,7 @@ def density(parts: Sequence[Gaussian], kind: int, points: Floats) -> Floats:
     return total
 
 
-def enumerate_posterior(
-    model: Line, time: float, prior: Bernoullis, scans: Sequence[LineScan], stride: int
-) -> Answer:
+def enumerate_posterior(model: Line, time: float, prior: Bernoullis, scans: Sequence[LineScan], stride: int) -> Answer:
     """Sum over all histories of all objects: of each whether and until when it is, and what it makes at each scan, no
     measurement being made twice; what none makes is a false alarm. Objects not seen before stand for the measurement
     that shows them first, scan number times stride plus measurement."""

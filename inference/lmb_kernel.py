@@ -374,7 +374,7 @@ def update(  # type: ignore[no-untyped-def]
                 w[have], k[have] = value, kind[c]
                 condition(mean[c], P[c], gains[pair_gain[p]], pair_y[p], m[have], V[have])
                 have += 1
-        if not total > faint:
+        if have == 0 or not total > faint:
             left_out += total
             continue
         at += reduce(

@@ -29,6 +29,7 @@ import numpy as np
 
 from inference.association import MAX_BITS
 from inference.lmb_kernel import heaviest, propagate, update
+from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, no_objects
@@ -142,6 +143,7 @@ def tell(belief: Belief, report: float, num_kinds: int) -> Objects:
     return Objects(objects.label[rows], objects.existence[rows], mean[rows], covariance[rows], kind[rows])
 
 
+@answers_first
 def run(
     model: HasObjects,
     scans: Sequence[Any],

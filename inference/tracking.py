@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from inference.progress import Progress, announce
+from inference.refusal import accept
 from inference.tracks import Objects, Tracks
 from models.multi_object import HasObjects, Timed
 from models.program import InputError
@@ -76,6 +77,7 @@ def track(
     if not patience >= 0.0:
         raise InputError(f"patience is {patience}; give the seconds that a scan may come late, 0 or more")
     scans = model.check(scans)
+    accept()
     past, told, seconds, now = list[Past](), list[Objects](), list[float](), list[float]()
     total, late, too_late = np.zeros(3), 0, 0  # facts of the steps that the belief is made of
     with Progress("tracking", len(scans), progress) as bar, announce("compiling the filter", after=4.0):

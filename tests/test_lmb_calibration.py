@@ -30,7 +30,7 @@ CAR = np.zeros(3)
 
 
 class Moment(NamedTuple):
-    """A scan, the object that made each measurement (-1 none), and the objects that are there: who, and their states."""
+    """A scan, the object that made each measurement (-1 none), and who is there, in which state."""
 
     scan: Scan
     source: Ints
@@ -141,8 +141,8 @@ def nees(error: Floats, covariance: Floats, entries: list[int]) -> float:
 
 def test_numbers_and_states_of_objects_that_come_and_go_are_calibrated() -> None:
     """CTRA and radar. The number of objects is right in each scan. States of sure objects, by whichever label is
-    nearest: which of two that came one after the other is which, the filter forgets. (Where newcomers' speed and heading
-    are known to 4 m/s and .2 rad only, range rates are not linear within their noise: 9.7 instead of 6.)"""
+    nearest: which of two that came one after the other is which, the filter forgets. (Where speed and heading of
+    newcomers are known to 4 m/s and .2 rad only, range rates are not linear within their noise: 9.7 instead of 6.)"""
     num, length = 60, 14
     told, true, found, where = (
         np.zeros((num, length)),

@@ -180,7 +180,7 @@ def test_no_scans_are_refused() -> None:
 
 
 def test_model_of_something_else_is_refused() -> None:
-    with pytest.raises(InputError, match="lmb needs a model of many objects, .*; dict is none"):
+    with pytest.raises(InputError, match=r"lmb needs a model of many objects, .*; dict is none"):
         lmb.run({}, drive())  # type: ignore[arg-type]
 
 

@@ -184,6 +184,17 @@ def test_what_known_objects_explain_begins_no_new_ones() -> None:
     assert facts.log_factor == pytest.approx(math.log(taken + missed) + 2 * math.log(kappa), rel=1e-9)
 
 
+@pytest.mark.parametrize("off", [(2.5, 2.5), (3.2, 0.0), (0.0, 3.2)])
+def test_measurements_beyond_the_gate_are_of_others(off: tuple[float, float]) -> None:
+    """By the squared Mahalanobis distance, which is 12.5 and 10.24 here; 8.8 would be within 9."""
+    prior = objects_at([[0.0, 0.0, 0.0, 0.0]], np.eye(4), [0.3])
+    for factor, within in ((1.0, False), (math.sqrt(8.8) / math.hypot(*off), True)):
+        scan = plots(1.0, [factor * math.sqrt(2.0) * np.array(off)])
+        belief, _ = step(STRAIGHT, Belief(1.0, prior), scan, 0, Knobs(gate=9.0))
+        missed = 0.3 * 0.1 / (1 - 0.3 * 0.9)
+        assert (abs(belief.objects.existence[0] - missed) > 1e-6) == within
+
+
 def test_every_measurement_may_have_noise_of_its_own() -> None:
     R = np.array([np.diag([1.0, 4.0]), [[9.0, 2.0], [2.0, 3.0]]])
     x, P = np.array([20.0, 30.0, 1.0, -1.0]), np.diag([2.0, 3.0, 1.0, 1.0]) + 0.4
@@ -429,6 +440,16 @@ def test_empty_scans_make_objects_less_probable() -> None:
         assert tracks.at(t).existence[0] == pytest.approx(r, rel=1e-9)
     assert len(tracks.at(21).label) == 0
     assert len(lmb.run(STRAIGHT, [plots(0.1 * k, []) for k in range(3)]).label) == 0
+
+
+def test_sure_object_that_a_sure_sensor_misses_is_gone() -> None:
+    """What cannot be is not a NaN, but told of by the log factor."""
+    model = replace(STRAIGHT, sensors=(replace(PLOTS, detection=1.0, extent=1e4),))
+    belief, facts = step(
+        model, Belief(1.0, objects_at([[0.0, 0.0, 0.0, 0.0]], np.eye(4), [1.0])), plots(1.0, []), 0, Knobs()
+    )
+    assert len(belief.objects.label) == 0
+    assert facts.log_factor == pytest.approx(math.log(1e-12), rel=1e-6)
 
 
 def test_sensor_that_begins_no_tracks() -> None:

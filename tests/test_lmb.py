@@ -493,6 +493,16 @@ def test_what_is_left_out_accounts_for_what_is_missing() -> None:
     assert facts.left_out == pytest.approx(every.objects.existence[~kept].sum(), rel=1e-12)
 
 
+@pytest.mark.parametrize(("existence", "faint"), [(0.01, 0.05), (1e-13, 0.0)])
+def test_known_objects_that_are_left_out_are_accounted_for(existence: float, faint: float) -> None:
+    """Also where the cut-off is none, but all components are lighter than any is kept."""
+    prior = objects_at([[0.0, 0.0, 0.0, 0.0], [50.0, 0.0, 0.0, 0.0]], np.eye(4), [existence, 0.6])
+    belief, facts = step(STRAIGHT, Belief(1.0, prior), plots(1.0, []), 0, Knobs(faint=faint))
+    assert belief.objects.label.tolist() == [-1]
+    assert belief.objects.components.offset.tolist() == [0, 1]
+    assert facts.left_out == pytest.approx(existence * 0.1 / (1 - 0.9 * existence), rel=1e-9)
+
+
 def test_five_thousand_false_alarms() -> None:
     """Each may be an object. Every object is compared with every measurement, but memory only grows with their sum:
     found 36 MB, and half a second a scan."""

@@ -258,6 +258,17 @@ def test_objects_arrive_at_places_as_often_as_the_rate_says() -> None:
     np.testing.assert_allclose(objects.components.mean[1:, :2], [[1.0, 2.0], [-1.0, 2.0]])
 
 
+def test_tracks_tell_of_what_is_probable_and_count_labels_as_they_appear() -> None:
+    model = replace(STRAIGHT, places=(Place((1.0, 2.0), 3.0, 0.02),))
+    scans = [plots(0.5 * k, [(60.0, 0.0), (0.0, 60.0)]) for k in range(4)]
+    every, some = lmb.run(model, scans, report=0.0), lmb.run(model, scans, report=0.2)
+    _, first = np.unique(every.label, return_index=True)
+    assert (np.diff(first) > 0).all()
+    assert len(first) > 3
+    np.testing.assert_array_equal(some.existence, every.existence[every.existence > 0.2])
+    assert 0 < len(some.label) < len(every.label)
+
+
 # what must change nothing
 
 

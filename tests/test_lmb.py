@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from inference import lmb
 from inference.lmb import STRIDE, Belief, Knobs, predict, step
 from inference.lmb_kernel import heaviest, reduce
-from models.multi_object import Bernoullis, Components
+from models.multi_object import Bernoullis, Components, no_objects
 from models.objects.motion import ConstantVelocity
 from models.objects.scans import Recording, Scan
 from models.objects.sensors import Position, Radar
@@ -96,7 +96,7 @@ def test_sure_object_without_clutter_is_kalmans() -> None:
 
 
 def test_sure_object_of_a_radar_is_an_extended_kalman_filter() -> None:
-    """CTRA and a radar that turns with the car; Jacobians by torch; the object passes behind it, where bearings jump."""
+    """CTRA and a radar that turns with the car; Jacobians by torch; the object passes behind, where bearings jump."""
     sensor = Radar(
         name="radar", noise_std=(0.4, 0.01, 0.2), mount=(1.0, 0.5, 0.2), detection=1.0, clutter=0.0, births=False
     )
@@ -129,7 +129,7 @@ def test_sure_object_of_a_radar_is_an_extended_kalman_filter() -> None:
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         at = pose + np.array([cos * 1.0 - sin * 0.5, sin * 1.0 + cos * 0.5, 0.2])
         state = torch.from_numpy(x)
-        F = torch.func.jacrev(lambda y: f(y, dt))(state).numpy()
+        F = torch.func.jacrev(f)(state, dt).numpy()
         c, s = math.cos(x[2]), math.sin(x[2])
         g = np.array([[c, 0, 0], [s, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 1]])
         white = np.array(
@@ -140,7 +140,7 @@ def test_sure_object_of_a_radar_is_an_extended_kalman_filter() -> None:
         Q[:2, :2] += 0.01 * dt * np.eye(2)
         x, P = f(state, dt).numpy(), F @ P @ F.T + Q
         state = torch.from_numpy(x)
-        predicted, H = h(state, at).numpy(), torch.func.jacrev(lambda y: h(y, at))(state).numpy()
+        predicted, H = h(state, at).numpy(), torch.func.jacrev(h)(state, at).numpy()
         z = predicted + rng.normal(0.0, sensor.noise_std)
         z[1] = math.remainder(z[1], 2 * math.pi)
         jumps += abs(z[1] - predicted[1]) > 3.0
@@ -157,9 +157,7 @@ def test_sure_object_of_a_radar_is_an_extended_kalman_filter() -> None:
 
 
 def test_first_measurement_begins_an_object_with_the_odds_of_unseen_to_clutter() -> None:
-    belief, facts = step(
-        STRAIGHT, Belief(None, objects_at(np.zeros((0, 4)), np.eye(4), [])), plots(3.0, [(20.0, 30.0)]), 7, Knobs()
-    )
+    belief, facts = step(STRAIGHT, Belief(None, no_objects(4)), plots(3.0, [(20.0, 30.0)]), 7, Knobs())
     clutter, unseen = 4.0 / 500.0**2, 0.9 * 1e-6 / (1 + 1e-4)  # the prior is a normal 100 times wider than noise
     assert belief.time == 3.0
     assert belief.objects.existence[0] == pytest.approx(unseen / (clutter + unseen), rel=1e-9)
@@ -186,6 +184,67 @@ def test_what_known_objects_explain_begins_no_new_ones() -> None:
     assert facts.log_factor == pytest.approx(math.log(taken + missed) + 2 * math.log(kappa), rel=1e-9)
 
 
+@pytest.mark.parametrize("off", [(2.5, 2.5), (3.2, 0.0), (0.0, 3.2)])
+def test_measurements_beyond_the_gate_are_of_others(off: tuple[float, float]) -> None:
+    """By the squared Mahalanobis distance, which is 12.5 and 10.24 here; 8.8 would be within 9."""
+    prior = objects_at([[0.0, 0.0, 0.0, 0.0]], np.eye(4), [0.3])
+    for factor, within in ((1.0, False), (math.sqrt(8.8) / math.hypot(*off), True)):
+        scan = plots(1.0, [factor * math.sqrt(2.0) * np.array(off)])
+        belief, _ = step(STRAIGHT, Belief(1.0, prior), scan, 0, Knobs(gate=9.0))
+        missed = 0.3 * 0.1 / (1 - 0.3 * 0.9)
+        assert (abs(belief.objects.existence[0] - missed) > 1e-6) == within
+
+
+def test_every_measurement_may_have_noise_of_its_own() -> None:
+    R = np.array([np.diag([1.0, 4.0]), [[9.0, 2.0], [2.0, 3.0]]])
+    x, P = np.array([20.0, 30.0, 1.0, -1.0]), np.diag([2.0, 3.0, 1.0, 1.0]) + 0.4
+    scan = plots(1.0, [(21.0, 30.5), (19.0, 32.0)])._replace(noise=R)
+    knobs = Knobs(least=0.0, merge=0.0, faint=0.0)
+    belief, _ = step(STRAIGHT, Belief(1.0, objects_at([x], P, [0.3])), scan, 0, knobs)
+    clutter, unseen = 4.0 / 500.0**2, 0.9 * 1e-6 / (1 + 1e-4)
+    H, none = np.eye(2, 4), np.full(2, math.inf)
+    taken, means = [], [x]
+    for z, own in zip(scan.values, R, strict=True):
+        S, off = P[:2, :2] + own, z - x[:2]
+        normal = math.exp(-0.5 * off @ np.linalg.solve(S, off)) / (2 * math.pi * math.sqrt(np.linalg.det(S)))
+        taken.append(0.3 * 0.9 * normal / (clutter + unseen))
+        means.append(kalman(x, P, z, x[:2], H, own, none)[0])
+    shares = np.array([0.3 * 0.1, *taken]) / (1 - 0.3 * 0.9 + sum(taken))
+    assert belief.objects.existence[0] == pytest.approx(shares.sum(), rel=1e-9)
+    found = sorted(mixture(belief.objects, 0), key=lambda part: -part[0])
+    for (weight, mean, _), i in zip(found, np.argsort(-shares), strict=True):
+        assert weight == pytest.approx(shares[i] / shares.sum(), rel=1e-9)
+        np.testing.assert_allclose(mean, means[i], rtol=1e-12)
+    for t, own in ((1, R[0]), (2, R[1])):
+        np.testing.assert_allclose(mixture(belief.objects, t)[0][2][:2, :2], own / 1.0001, rtol=1e-6)
+
+
+def test_radar_that_looks_back_begins_objects_where_they_are() -> None:
+    """Its bearings are a turn away from those that the world's angles predict."""
+    pose = np.array([5.0, 3.0, 3.0])
+    belief, _ = step(
+        TURNING, Belief(None, no_objects(6)), Scan("radar", 0.0, np.array([[20.0, 1.0, 0.0]]), pose), 0, Knobs()
+    )
+    for _, mean, P in mixture(belief.objects, 0):
+        np.testing.assert_allclose(mean[:2], [5.0 + 20.0 * math.cos(4.0), 3.0 + 20.0 * math.sin(4.0)], atol=0.01)
+        across = np.array([-math.sin(4.0), math.cos(4.0)])
+        assert across @ P[:2, :2] @ across == pytest.approx(0.2**2, rel=0.05)
+    assert belief.objects.existence[0] > 0.1
+
+
+def test_components_that_are_one_around_the_circle_become_one() -> None:
+    prior = objects_at([[10.0, 0.0, 3.1, 5.0, 0.0, 0.0], [10.0, 0.0, -3.1, 5.0, 0.0, 0.0]], np.eye(6), [0.5, 0.5])
+    one = Bernoullis(
+        prior.label[:1],
+        prior.existence[:1],
+        prior.components._replace(offset=np.array([0, 2]), weight=np.array([0.6, 0.4])),
+    )
+    belief, _ = step(TURNING, Belief(0.0, one), Scan("radar", 0.0, np.zeros((0, 3)), CAR), 0, Knobs())
+    ((weight, mean, _),) = mixture(belief.objects, 0)
+    assert weight == 1.0
+    assert mean[2] == pytest.approx(3.1 + 0.4 * (2 * math.pi - 6.2), rel=1e-12)
+
+
 def test_objects_arrive_at_places_as_often_as_the_rate_says() -> None:
     model = replace(STRAIGHT, places=(Place((1.0, 2.0), 3.0, 0.02), Place((-1.0, 2.0), 3.0, 0.5)), unseen_density=0.0)
     belief = Belief(1.0, objects_at([[20.0, 30.0, 0.0, 0.0]], np.eye(4), [0.3]))
@@ -197,6 +256,17 @@ def test_objects_arrive_at_places_as_often_as_the_rate_says() -> None:
     )
     assert objects.components.offset.tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(objects.components.mean[1:, :2], [[1.0, 2.0], [-1.0, 2.0]])
+
+
+def test_tracks_tell_of_what_is_probable_and_count_labels_as_they_appear() -> None:
+    model = replace(STRAIGHT, places=(Place((1.0, 2.0), 3.0, 0.02),))
+    scans = [plots(0.5 * k, [(60.0, 0.0), (0.0, 60.0)]) for k in range(4)]
+    every, some = lmb.run(model, scans, report=0.0), lmb.run(model, scans, report=0.2)
+    _, first = np.unique(every.label, return_index=True)
+    assert (np.diff(first) > 0).all()
+    assert len(first) > 3
+    np.testing.assert_array_equal(some.existence, every.existence[every.existence > 0.2])
+    assert 0 < len(some.label) < len(every.label)
 
 
 # what must change nothing
@@ -383,6 +453,16 @@ def test_empty_scans_make_objects_less_probable() -> None:
     assert len(lmb.run(STRAIGHT, [plots(0.1 * k, []) for k in range(3)]).label) == 0
 
 
+def test_sure_object_that_a_sure_sensor_misses_is_gone() -> None:
+    """What cannot be is not a NaN, but told of by the log factor."""
+    model = replace(STRAIGHT, sensors=(replace(PLOTS, detection=1.0, extent=1e4),))
+    belief, facts = step(
+        model, Belief(1.0, objects_at([[0.0, 0.0, 0.0, 0.0]], np.eye(4), [1.0])), plots(1.0, []), 0, Knobs()
+    )
+    assert len(belief.objects.label) == 0
+    assert facts.log_factor == pytest.approx(math.log(1e-12), rel=1e-6)
+
+
 def test_sensor_that_begins_no_tracks() -> None:
     quiet = replace(PLOTS, name="quiet", births=False)
     model = replace(STRAIGHT, sensors=(PLOTS, quiet))
@@ -423,6 +503,16 @@ def test_what_is_left_out_accounts_for_what_is_missing() -> None:
     np.testing.assert_array_equal(some.objects.label, every.objects.label[kept])
     np.testing.assert_array_equal(some.objects.existence, every.objects.existence[kept])
     assert facts.left_out == pytest.approx(every.objects.existence[~kept].sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize(("existence", "faint"), [(0.01, 0.05), (1e-13, 0.0)])
+def test_known_objects_that_are_left_out_are_accounted_for(existence: float, faint: float) -> None:
+    """Also where the cut-off is none, but all components are lighter than any is kept."""
+    prior = objects_at([[0.0, 0.0, 0.0, 0.0], [50.0, 0.0, 0.0, 0.0]], np.eye(4), [existence, 0.6])
+    belief, facts = step(STRAIGHT, Belief(1.0, prior), plots(1.0, []), 0, Knobs(faint=faint))
+    assert belief.objects.label.tolist() == [-1]
+    assert belief.objects.components.offset.tolist() == [0, 1]
+    assert facts.left_out == pytest.approx(existence * 0.1 / (1 - 0.9 * existence), rel=1e-9)
 
 
 def test_five_thousand_false_alarms() -> None:
@@ -480,7 +570,7 @@ def broken(**parts: Any) -> Scan:
         (broken(pose=np.array([0.0, math.nan, 0.0])), r"'plots' at 0.5 s has nan in its pose \(x, y, heading\)"),
         (broken(pose=np.zeros(2)), r"has pose \(x, y, heading\) of shape \(2,\); give \(3,\)"),
         (broken(noise=np.eye(2)), r"has covariances of shape \(2, 2\); give \(2, 2, 2\)"),
-        (broken(noise=np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])), r"positive definite, of measurement 1: \[\[1.0, 2"),
+        (broken(noise=np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])), r"definite, of measurement 1: \[\[1.0, 2"),
         (broken(noise=np.array([np.eye(2), [[1.0, 0.5], [0.2, 1.0]]])), "not symmetric and positive definite"),
         (broken(noise=np.array([np.eye(2), np.zeros((2, 2))])), "positive definite, of measurement 1"),
         (broken(noise=np.full((2, 2, 2), math.inf)), "has inf in its covariances"),
@@ -541,7 +631,7 @@ STATE, P4 = [1.0, 2.0, 0.5, 0.5], np.eye(4)
 )  # fmt: skip
 def test_no_nan_passes(prior: Bernoullis, places: Any) -> None:
     with pytest.raises(
-        FloatingPointError, match="the update by sensor 'plots' at 0.1 s made a number that is not finite"
+        FloatingPointError, match=r"the update by sensor 'plots' at 0.1 s made a number that is not finite"
     ):
         step(STRAIGHT, Belief(0.0, prior), plots(0.1, places), 0, Knobs())
 

@@ -61,6 +61,12 @@ def test_any_order_of_arrival_ends_in_the_order_of_time(order: tuple[float, ...]
     assert tracks.info["flags"] == []
 
 
+def test_all_that_may_be_done_again_is_remembered() -> None:
+    times = (0.0, 0.3, 0.6, 0.9, 0.05)
+    beliefs, _ = remembered(times)
+    assert beliefs[-1].told == tuple(sorted((time, number) for number, time in enumerate(times)))
+
+
 def test_what_is_counted_of_steps_is_not_counted_twice_where_they_are_done_again() -> None:
     _, tracks = remembered((0.0, 0.9, 0.5, 0.4))
     assert tracks.info["left_out"] == pytest.approx(0.009, abs=1e-15)
@@ -180,7 +186,7 @@ def test_no_scans_are_refused() -> None:
 
 
 def test_model_of_something_else_is_refused() -> None:
-    with pytest.raises(InputError, match="lmb needs a model of many objects, .*; dict is none"):
+    with pytest.raises(InputError, match=r"lmb needs a model of many objects, .*; dict is none"):
         lmb.run({}, drive())  # type: ignore[arg-type]
 
 

@@ -85,7 +85,9 @@ LASER = Measurement(
         Figure("kitti_samota", "", "sMOTA averaged over 40 recalls", f".884 {PUBLIC}", at_least=0.92),
         Figure("kitti_ids", "", "switches of track from one frame to the next", f"0 {PUBLIC}", at_most=5),
         Figure("kitti_frag", "", "fragmentations", f"59 {PUBLIC}", at_most=60),
-        Figure("kitti_ms_per_frame", "ms", "median time of the filter, all scans of a frame", "17 AB3DMOT", at_most=1.0),
+        Figure(
+            "kitti_ms_per_frame", "ms", "median time of the filter, all scans of a frame", "17 AB3DMOT", at_most=1.0
+        ),
     ),
     laser,
 )

@@ -26,7 +26,7 @@ from scipy.special import expit, logit
 from experiments.kitti_boxes import image_boxes, in_view
 from experiments.kitti_matching import TrackBoxes, boxes_of, compare, match
 from experiments.scenarios.kitti_scans import CAMERA, LASER, KittiTruth
-from experiments.scenarios.kitti_tracking import KittiSequence, frames_of
+from experiments.scenarios.kitti_tracking import KittiSequence
 from inference.tracks import Tracks, rows_by_label
 from models.objects.scans import Scan
 from models.program import InputError
@@ -84,11 +84,11 @@ class Calibration(NamedTuple):
 def candidates(tracks: Tracks, scans: Sequence[Scan], sequence: KittiSequence) -> Candidates:
     """What the filter believes after each frame. Raises InputError for tracks that do not say what they were seen by,
     or that are not of the sequence."""
-    if tracks.measurement is None:
-        raise InputError("calibrated existence reads which measurement is of which object; choose engine=lmb")
     last = np.flatnonzero(np.diff(tracks.time, append=np.inf) > 0.0)  # of each frame's scans
     if len(last) != len(sequence.time) or len(scans) != len(tracks.time):
-        raise InputError(f"tracks of {len(last)} frames are not of sequence {sequence.name}: {len(sequence.time)} frames")
+        raise InputError(
+            f"tracks of {len(last)} frames are not of sequence {sequence.name}: {len(sequence.time)} frames"
+        )
     rows = np.flatnonzero(np.isin(tracks.scan, last))
     offset = np.concatenate([[0], np.cumsum(np.diff(tracks.offset)[last])])
     (z, height, width, length, heading) = tracks.entries("z", "height", "width", "length", "heading")
@@ -103,7 +103,12 @@ def candidates(tracks: Tracks, scans: Sequence[Scan], sequence: KittiSequence) -
         r,
     )
     spread = np.sqrt(tracks.covariance[rows, 0, 0] + tracks.covariance[rows, 1, 1])
-    own = [logit(np.clip(r, FAINT, 1.0 - FAINT)), np.log(spread), *_place(boxes, sequence), _crowded(boxes, mean[:, :2])]
+    own = [
+        logit(np.clip(r, FAINT, 1.0 - FAINT)),
+        np.log(spread),
+        *_place(boxes, sequence),
+        _crowded(boxes, mean[:, :2]),
+    ]
     past = {name: Past(*(part[rows] for part in past_of(tracks, scans, name))) for name in (LASER, CAMERA)}
     own += _seen(past[LASER], own[3]) + (_confirmed(past[CAMERA], own[3]) if CAMERA in tracks.sensor else [])
     shown = in_view(boxes.box, sequence.projection, sequence.image)
@@ -147,6 +152,8 @@ def _confirmed(past: Past, far: Floats) -> list[Floats]:
 
 def past_of(tracks: Tracks, scans: Sequence[Scan], sensor: str) -> Past:
     """What a sensor has shown of the object of each row of tracks, until then."""
+    if tracks.measurement is None:
+        raise InputError("calibrated existence reads which measurement is of which object; choose engine=lmb")
     found = Past(*np.zeros((6, len(tracks.label))))
     own = np.array([name == sensor for name in tracks.sensor])[tracks.scan]
     hit = own & (tracks.measurement >= 0)
@@ -221,7 +228,9 @@ def report(found: Candidates, calibration: Calibration, *, on: float = ON, off: 
     return TrackBoxes(offset, found.boxes.track[told], found.boxes.box[told], p[told])
 
 
-def leave_one_out(truths: Sequence[KittiTruth], found: Sequence[Candidates], *, on: float = ON, off: float = OFF) -> list[TrackBoxes]:
+def leave_one_out(
+    truths: Sequence[KittiTruth], found: Sequence[Candidates], *, on: float = ON, off: float = OFF
+) -> list[TrackBoxes]:
     """What is told of in each sequence, calibrated on all others."""
     told = list[TrackBoxes]()
     for i in range(len(found)):

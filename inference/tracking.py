@@ -119,8 +119,8 @@ def _tracks(
 ) -> Tracks:
     """All that was told, labels counted from 0 in the order of their first appearance."""
     size = [len(objects.label) for objects in told]
-    *rows, shown = zip(*told, strict=True)
-    rows = [np.concatenate(parts) for parts in rows]
+    *parts, shown = zip(*told, strict=True)
+    rows = [np.concatenate(part) for part in parts]
     _, first, which = np.unique(rows[0], return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

@@ -203,7 +203,7 @@ class Tracks(Posterior):
             )
         return rows
 
-    def _by_row(self) -> dict[str, NDArray[Any]]:
+    def _by_row(self) -> dict[str, Any]:
         """Those of them that have a row for each object."""
         return {name: values for name, values in self._arrays().items() if name in Objects._fields}
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from models.multi_object import Bernoullis, Components, no_components
 from models.objects.box_detector import BoxDetector, ImageBox
 from models.objects.motion import ConstantTurn, ConstantVelocity, Motion
 from models.objects.scans import Recording, Scan
 from models.objects.scene import scan_set, simulate_scan
 from models.objects.sensors import Sensor, sensor_formulas, spread_formula
 from models.objects.traffic import Kind, Traffic
-from models.multi_object import Bernoullis, Components, no_components
 
 BOX = ("z", "height", "width", "length")
 TURN, VELOCITY = ConstantTurn(BOX, accelerates=False), ConstantVelocity(("heading", *BOX))
@@ -65,7 +65,9 @@ def test_filters_and_the_program_are_told_the_same(sensor: Sensor) -> None:
     objects = Bernoullis(
         np.arange(num),
         np.ones(num),
-        Components(np.arange(num + 1), np.ones(num), np.zeros(num, np.int64), x, np.tile(np.eye(x.shape[1]), (num, 1, 1))),
+        Components(
+            np.arange(num + 1), np.ones(num), np.zeros(num, np.int64), x, np.tile(np.eye(x.shape[1]), (num, 1, 1))
+        ),
     )
     scan = Scan(sensor.name, 0.0, np.tile(0.1, (2, len(sensor.names))), POSE)
     view = model.view(scan, objects, no_components(x.shape[1], 2))
@@ -89,7 +91,9 @@ def test_false_alarms_of_boxes_add_up_to_their_density_times_the_area_in_view() 
 def test_an_image_box_is_the_hull_of_the_four_corners() -> None:
     """A car straight ahead, and one across, whose nearest side is wider."""
     measure, _ = sensor_formulas(TURN, ImageBox, len(IMAGE.settings))
-    x = np.array([[20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.5, 1.6, 4.0], [20.0, 3.0, math.pi / 2, 0.0, 0.0, 0.0, 1.5, 1.6, 4.0]])
+    x = np.array(
+        [[20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.5, 1.6, 4.0], [20.0, 3.0, math.pi / 2, 0.0, 0.0, 0.0, 1.5, 1.6, 4.0]]
+    )
     found = measure(x, np.zeros((1, 3)))
     np.testing.assert_allclose(found[0], [math.atan2(0.8, 18.0), -math.atan2(0.8, 18.0), 1.5 / 18.0], rtol=1e-12)
     np.testing.assert_allclose(found[1], [math.atan2(5.0, 19.2), math.atan2(1.0, 20.8), 1.5 / 19.2], rtol=1e-12)

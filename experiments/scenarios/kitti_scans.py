@@ -1,5 +1,5 @@
-"""KITTI's tracking sequences as scans of two sensors, `pointrcnn` (boxes from laser points) and `rrc` (boxes in the image
-of the camera), in the frame of the poses: what models of traffic read.
+"""KITTI's tracking sequences as scans of two sensors, `pointrcnn` (boxes from laser points) and `rrc` (boxes in the
+image of the camera), in the frame of the poses: what models of traffic read.
 
 A detector's score s is a logit of its own. What it says, and how noise falls with it, was read off the labels once for
 all sequences together, with few digits:
@@ -72,7 +72,7 @@ def laser_scan(sequence: KittiSequence, t: int) -> Scan:
     axis = found.heading[rows] - pose[2]
     values = np.column_stack([distance, bearing, axis, found.position[rows, 2], found.size[rows]])
     score = found.score[rows]
-    std = NOISE * np.clip(np.exp(-SHARPENING * (score - PLAIN)), *FACTOR)[:, None]
+    std = np.array(NOISE) * np.clip(np.exp(-SHARPENING * (score - PLAIN)), *FACTOR)[:, None]
     std[:, 1] /= np.maximum(distance, 1.0)
     said = 1.0 / (1.0 + np.exp(-np.clip(STEEP * (score - EVEN), *SAID)))
     return Scan(LASER, float(sequence.time[t]), values, pose, np.square(std)[:, :, None] * np.eye(len(NOISE)), said)

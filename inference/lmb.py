@@ -27,10 +27,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from inference.association import MAX_BITS
 from inference.lmb_kernel import heaviest, propagate, update
+from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Ints, Timed, no_objects
+from models.program import InputError
 
 STRIDE = 1 << 20  # labels: number of the scan times this, plus the measurement
 LONGEST = 0.5  # a longer time is gone in several steps: motion is linearised at each [s]
@@ -40,9 +43,9 @@ class Knobs(NamedTuple):
     """Settings of the approximations.
 
     gate        squared Mahalanobis distance beyond which a measurement is not of a component
-    least       components lighter than this share of their object are left out
+    least       components lighter than this share of their object are left out, but for the heaviest of each kind
     merge       squared Mahalanobis distance within which components are one
-    most        components of an object
+    most        components of each kind of an object
     faint       objects less probable than this are left out, newcomers at a tenth of it
     max_shared  measurements that objects of a group may share for exact association; belief propagation beyond
     """
@@ -53,6 +56,23 @@ class Knobs(NamedTuple):
     most: int = 4
     faint: float = 1e-3
     max_shared: int = 8
+
+
+def check(knobs: Knobs, report: float) -> None:
+    """Raise InputError for settings that no filter can have."""
+    wanted = {
+        "gate": (knobs.gate > 0.0, "a positive number"),
+        "least": (0.0 <= knobs.least < 1.0, "a share from 0 to below 1"),
+        "merge": (knobs.merge >= 0.0, "a number of 0 or more"),
+        "most": (knobs.most >= 1, "1 or more"),
+        "faint": (0.0 <= knobs.faint < 1.0, "a probability below 1"),
+        "max_shared": (0 <= knobs.max_shared <= MAX_BITS, f"0 to {MAX_BITS} bits"),
+    }
+    for name, (right, what) in wanted.items():
+        if not right:
+            raise InputError(f"{name} is {getattr(knobs, name)}; give {what}")
+    if not 0.0 <= report < 1.0:
+        raise InputError(f"report is {report}; give a probability below 1")
 
 
 class Belief(NamedTuple):
@@ -107,8 +127,12 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     label = np.empty(len(source), dtype=np.int64)
     label[~born] = objects.label[source[~born]]
     label[born] = number * STRIDE - 1 - source[born]
-    if not np.isfinite(existence).all() or not math.isfinite(log_factor):
-        raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
+    finite = all(math.isfinite(part.sum()) for part in (existence, *parts)) and math.isfinite(log_factor + left_out)
+    if not finite or parts[-1].diagonal(0, 1, 2).min(initial=0.0) < 0.0:
+        raise FloatingPointError(
+            f"the update by sensor '{scan.sensor}' at {scan.time} s made a number that is not finite, or a negative "
+            "variance; look for noises, speeds or gaps between scans that are far too large"
+        )
     posterior = Bernoullis(label, existence, Components(*parts))
     return Belief(scan.time, posterior, measurement), Facts(log_factor, int(loopy), float(left_out))
 
@@ -123,6 +147,7 @@ def tell(belief: Belief, report: float, num_kinds: int) -> Objects:
     )
 
 
+@answers_first
 def run(
     model: HasObjects,
     scans: Sequence[Any],
@@ -145,9 +170,10 @@ def run(
     report               objects less probable than this are not told of
 
     State and covariance of an object are those of its heaviest component. Raises InputError for a model of something
-    else than many objects, and for a scan that it cannot use."""
+    else than many objects, for settings out of their range, and for a scan that it cannot use."""
     require_objects(model, "lmb")
     knobs = Knobs(gate, least, merge, most, faint, max_shared)
+    check(knobs, report)
     return track(
         model,
         scans,

@@ -15,6 +15,7 @@ from inference.association_kernel import AUTO, associate
 LOG_TAU = math.log(2 * math.pi)
 TOLERANCE, MAX_ITERATIONS = 1e-6, 200  # of belief propagation in large groups
 FIRST = 0.1  # newcomers are kept at this share of `faint`: nothing can have confirmed them yet
+NO_KIND = 1e-9  # share of an object below which it is not of a kind
 SMALL = 1e-12  # posterior components of less weight are left out before anything is computed of them
 
 
@@ -141,58 +142,60 @@ def condition(mean, P, W, y, new_mean, new_P):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def reduce(count, w, kind, mean, P, period, least, merge, most, first, out_w, out_kind, out_mean, out_P):  # type: ignore[no-untyped-def]
+def reduce(count, w, kind, num_kinds, mean, P, period, least, merge, most, first, out_w, out_kind, out_mean, out_P):  # type: ignore[no-untyped-def]
     """Reduce a mixture of `count` components to few, written from `first` on, weights summing to one; how many.
 
-    The heaviest takes in all of its kind within `merge` of it (squared Mahalanobis distance, its own covariance), by
-    moments; and so on with the rest, until `most` are there or what is left is lighter than `least` of all."""
+    Of each kind, the heaviest takes in all within `merge` of it (squared Mahalanobis distance, its own covariance), by
+    moments; and so on with the rest, until `most` are there or what is left is lighter than `least` of all. But the
+    first component of a kind stays unless the kind has as good as no weight: what an object is may show late."""
     n = mean.shape[1]
     C, difference, y, centre = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
     total = 0.0
     for i in range(count):
         total += w[i]
-    made, kept = 0, 0.0
-    while made < most:
-        heaviest, most_weight = -1, least * total
-        for i in range(count):
-            if w[i] > most_weight:
-                heaviest, most_weight = i, w[i]
-        if heaviest < 0:
-            break
-        at = first + made
-        cholesky(P[heaviest], C)
-        out_w[at], out_kind[at] = 0.0, kind[heaviest]
-        for i in range(n):
-            centre[i] = mean[heaviest, i]
-            out_mean[at, i] = 0.0
-            for j in range(n):
-                out_P[at, i, j] = 0.0
-        for k in range(count):
-            if w[k] <= 0.0 or kind[k] != kind[heaviest]:
-                continue
+    at, kept = first, 0.0
+    for own in range(num_kinds):
+        start = at
+        while at - start < most:
+            heaviest, most_weight = -1, (NO_KIND if at == start else least) * total
+            for i in range(count):
+                if kind[i] == own and w[i] > most_weight:
+                    heaviest, most_weight = i, w[i]
+            if heaviest < 0:
+                break
+            cholesky(P[heaviest], C)
+            out_w[at], out_kind[at] = 0.0, own
             for i in range(n):
-                difference[i] = wrapped(mean[k, i] - centre[i], period[i])
-            if k != heaviest and not whiten(C, difference, y) <= merge:
-                continue
-            out_w[at] += w[k]
+                centre[i] = mean[heaviest, i]
+                out_mean[at, i] = 0.0
+                for j in range(n):
+                    out_P[at, i, j] = 0.0
+            for k in range(count):
+                if w[k] <= 0.0 or kind[k] != own:
+                    continue
+                for i in range(n):
+                    difference[i] = wrapped(mean[k, i] - centre[i], period[i])
+                if k != heaviest and not whiten(C, difference, y) <= merge:
+                    continue
+                out_w[at] += w[k]
+                for i in range(n):
+                    out_mean[at, i] += w[k] * difference[i]
+                    for j in range(i + 1):
+                        out_P[at, i, j] += w[k] * (P[k, i, j] + difference[i] * difference[j])
+                w[k] = 0.0
             for i in range(n):
-                out_mean[at, i] += w[k] * difference[i]
+                out_mean[at, i] /= out_w[at]
+            for i in range(n):
                 for j in range(i + 1):
-                    out_P[at, i, j] += w[k] * (P[k, i, j] + difference[i] * difference[j])
-            w[k] = 0.0
-        for i in range(n):
-            out_mean[at, i] /= out_w[at]
-        for i in range(n):
-            for j in range(i + 1):
-                value = out_P[at, i, j] / out_w[at] - out_mean[at, i] * out_mean[at, j]
-                out_P[at, i, j] = out_P[at, j, i] = value
-        for i in range(n):
-            out_mean[at, i] += centre[i]
-        kept += out_w[at]
-        made += 1
-    for at in range(first, first + made):
-        out_w[at] /= kept
-    return made
+                    value = out_P[at, i, j] / out_w[at] - out_mean[at, i] * out_mean[at, j]
+                    out_P[at, i, j] = out_P[at, j, i] = value
+            for i in range(n):
+                out_mean[at, i] += centre[i]
+            kept += out_w[at]
+            at += 1
+    for i in range(first, at):
+        out_w[i] /= kept
+    return at - first
 
 
 @njit(error_model="numpy")
@@ -239,6 +242,7 @@ def update(  # type: ignore[no-untyped-def]
     -1 - j for one that measurement j shows first; measurement (T',) the one that most probably is of it, -1 where it
     was more probably missed; facts = (log partition, groups by belief propagation, existence left out)."""
     num, count, n, d, M = len(existence), len(weight), mean.shape[1], slope.shape[1], len(values)
+    num_kinds = feature.shape[1]
     mass, rho = unseen_mass(
         new_offset,
         new_weight,
@@ -349,7 +353,7 @@ def update(  # type: ignore[no-untyped-def]
         widest = max(widest, new_offset[fresh[b] + 1] - new_offset[fresh[b]])
     w, k, m, V = np.empty(widest), np.empty(widest, np.int64), np.empty((widest, n)), np.empty((widest, n, n))
     source, shown, out_existence = np.empty(num + born, np.int64), np.empty(num + born, np.int64), np.empty(num + born)
-    out_offset, room = np.zeros(num + born + 1, np.int64), (num + born) * most
+    out_offset, room = np.zeros(num + born + 1, np.int64), (num + born) * most * num_kinds
     out_w, out_kind, out_mean, out_P = (
         np.empty(room), np.empty(room, np.int64), np.empty((room, n)), np.empty((room, n, n))
     )  # fmt: skip
@@ -372,10 +376,12 @@ def update(  # type: ignore[no-untyped-def]
                 w[have], k[have] = value, kind[c]
                 condition(mean[c], P[c], gains[pair_gain[p]], pair_y[p], m[have], V[have])
                 have += 1
-        if not total > faint:
+        if have == 0 or not total > faint:
             left_out += total
             continue
-        at += reduce(have, w, k, m, V, state_period, least, merge, most, at, out_w, out_kind, out_mean, out_P)
+        at += reduce(
+            have, w, k, num_kinds, m, V, state_period, least, merge, most, at, out_w, out_kind, out_mean, out_P
+        )
         source[made], out_existence[made], out_offset[made + 1] = t, min(total, 1.0), at
         shown[made], surest = -1, missing
         for e in range(table_offset[t], table_offset[t + 1]):
@@ -399,7 +405,9 @@ def update(  # type: ignore[no-untyped-def]
             w[have], k[have] = mass[u] / rho[j], new_kind[u]
             condition(new_mean[u], new_P[u], W, y, m[have], V[have])
             have += 1
-        at += reduce(have, w, k, m, V, state_period, least, merge, most, at, out_w, out_kind, out_mean, out_P)
+        at += reduce(
+            have, w, k, num_kinds, m, V, state_period, least, merge, most, at, out_w, out_kind, out_mean, out_P
+        )
         source[made], out_existence[made], out_offset[made + 1] = -1 - j, first_existence[j], at
         shown[made] = j
         made += 1

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from inference.progress import Progress, announce
+from inference.refusal import accept
 from inference.tracks import Objects, Tracks
 from models.multi_object import HasObjects, Timed
 from models.program import InputError
@@ -73,9 +74,12 @@ def track(
     cannot use."""
     if not len(scans):
         raise InputError("a filter needs at least one scan, but got none; wait for the first")
+    if not patience >= 0.0:
+        raise InputError(f"patience is {patience}; give the seconds that a scan may come late, 0 or more")
     scans = model.check(scans)
+    accept()
     past, told, seconds, now = list[Past](), list[Objects](), list[float](), list[float]()
-    log_factor, loopy, left_out, late, too_late = 0.0, 0, 0.0, 0, 0
+    total, late, too_late = np.zeros(3), 0, 0  # facts of the steps that the belief is made of
     with Progress("tracking", len(scans), progress) as bar, announce("compiling the filter", after=4.0):
         for number, scan in enumerate(scans):
             begin = time.perf_counter()
@@ -86,20 +90,21 @@ def track(
                 past = [entry for entry in past if entry.scan.time <= scan.time]
                 late += bool(after)
                 belief = after[0].before if after else belief
-                log_factor -= sum(entry.facts.log_factor for entry in after)
+                for entry in after:
+                    total -= entry.facts
                 for then, at in [(number, scan), *((entry.number, entry.scan) for entry in after)]:
                     before = belief
                     belief, facts = step(before, at, then)
                     past.append(Past(before, at, then, facts))
-                    log_factor += facts.log_factor
-                    loopy, left_out = loopy + facts.loopy, left_out + facts.left_out
+                    total += facts
                 past = [entry for entry in past if entry.scan.time >= past[-1].scan.time - patience]
             seconds.append(time.perf_counter() - begin)
             now.append(float(belief.time or 0.0))
             told.append(tell(belief))
             bar.advance(1)
+    log_factor, loopy, left_out = total.tolist()
     info = {"step_seconds": seconds, "scans": len(scans), "late": late, "too_late": too_late}
-    info |= {"groups_by_belief_propagation": loopy, "left_out": left_out}
+    info |= {"groups_by_belief_propagation": int(loopy), "left_out": left_out}
     flags = list[str]()
     if too_late:
         flags.append(f"{too_late} of {len(scans)} scans came more than {patience} s late and were left out")

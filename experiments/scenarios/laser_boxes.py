@@ -11,7 +11,8 @@ the box of each cluster of points.
               and shapes, weighted by exp(-S(a) / (2 std^2)) p(sizes seen | s) share_s: an unseen rear half of a car
               and a heading that few points leave open are in the covariance
 
-Clusters next to something nearer are left out, for it may hide a part of them.
+Clusters next to something nearer are left out, for it may hide a part of them. What a box is wrong by lasts while the
+object is seen from the same side: a filter that takes errors for independent from scan to scan is too sure.
 """
 
 from __future__ import annotations

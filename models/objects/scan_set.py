@@ -106,7 +106,7 @@ class ScanSet(TorchDistribution):
         error = torch.linalg.cholesky(self.noise[..., 0, :, :]) @ torch.randn(*shape, num, d, 1)
         measured = self.predicted + error[..., 0]
         alarms = capacity(num, self.false_alarms.expected) - num
-        count = torch.poisson(torch.full(shape, self.false_alarms.expected)).clamp(max=alarms)
+        count = torch.poisson(torch.full(shape, float(self.false_alarms.expected))).clamp(max=alarms)
         low, high = self.false_alarms.low, self.false_alarms.high
         false = low + (high - low) * torch.rand(*shape, alarms, d)
         present = torch.cat([seen, torch.arange(alarms) < count[..., None]], -1)

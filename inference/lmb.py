@@ -32,7 +32,7 @@ from inference.lmb_kernel import heaviest, propagate, update
 from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
-from models.multi_object import Bernoullis, Components, HasObjects, Timed, no_objects
+from models.multi_object import Bernoullis, Components, HasObjects, Ints, Timed, no_objects
 from models.program import InputError
 
 STRIDE = 1 << 20  # labels: number of the scan times this, plus the measurement
@@ -76,10 +76,12 @@ def check(knobs: Knobs, report: float) -> None:
 
 
 class Belief(NamedTuple):
-    """What is believed at a time [s], None before the first scan."""
+    """What is believed at a time [s], None before the first scan; and which measurement of the scan of then most
+    probably is of each object (T,), -1 where it was more probably missed."""
 
     time: float | None
     objects: Bernoullis
+    measurement: Ints = np.zeros(0, dtype=np.int64)
 
 
 def predict(model: HasObjects, belief: Belief, seconds: float, number: int) -> Bernoullis:
@@ -117,7 +119,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
         objects = predict(model, belief, seconds, number)
     unseen = model.unseen(scan)
     view = model.view(scan, objects, unseen)
-    source, existence, *parts, (log_factor, loopy, left_out) = update(
+    source, measurement, existence, *parts, (log_factor, loopy, left_out) = update(
         objects.existence, *objects.components, *unseen, *view,
         model.period, knobs.gate, knobs.least, knobs.merge, knobs.most, knobs.faint, knobs.max_shared,
     )  # fmt: skip
@@ -132,7 +134,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
             "variance; look for noises, speeds or gaps between scans that are far too large"
         )
     posterior = Bernoullis(label, existence, Components(*parts))
-    return Belief(scan.time, posterior), Facts(log_factor, int(loopy), float(left_out))
+    return Belief(scan.time, posterior, measurement), Facts(log_factor, int(loopy), float(left_out))
 
 
 def tell(belief: Belief, report: float, num_kinds: int) -> Objects:
@@ -140,7 +142,9 @@ def tell(belief: Belief, report: float, num_kinds: int) -> Objects:
     objects = belief.objects
     mean, covariance, kind = heaviest(*objects.components, num_kinds)
     rows = np.flatnonzero(objects.existence > report)
-    return Objects(objects.label[rows], objects.existence[rows], mean[rows], covariance[rows], kind[rows])
+    return Objects(
+        objects.label[rows], objects.existence[rows], mean[rows], covariance[rows], kind[rows], belief.measurement[rows]
+    )
 
 
 @answers_first

@@ -238,8 +238,9 @@ def update(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """The posterior of T objects given a scan, with those that it shows first; equations in inference.lmb.
 
-    Returns (source, existence, offset, weight, kind, mean, P, facts): source (T',) is the old object, or -1 - j for one
-    that measurement j shows first; facts = (log partition, groups by belief propagation, existence left out)."""
+    Returns (source, measurement, existence, offset, weight, kind, mean, P, facts): source (T',) is the old object, or
+    -1 - j for one that measurement j shows first; measurement (T',) the one that most probably is of it, -1 where it
+    was more probably missed; facts = (log partition, groups by belief propagation, existence left out)."""
     num, count, n, d, M = len(existence), len(weight), mean.shape[1], slope.shape[1], len(values)
     num_kinds = feature.shape[1]
     mass, rho = unseen_mass(
@@ -351,21 +352,22 @@ def update(  # type: ignore[no-untyped-def]
     for b in range(born):
         widest = max(widest, new_offset[fresh[b] + 1] - new_offset[fresh[b]])
     w, k, m, V = np.empty(widest), np.empty(widest, np.int64), np.empty((widest, n)), np.empty((widest, n, n))
-    source, out_existence = np.empty(num + born, np.int64), np.empty(num + born)
+    source, shown, out_existence = np.empty(num + born, np.int64), np.empty(num + born, np.int64), np.empty(num + born)
     out_offset, room = np.zeros(num + born + 1, np.int64), (num + born) * most * num_kinds
     out_w, out_kind, out_mean, out_P = (
         np.empty(room), np.empty(room, np.int64), np.empty((room, n)), np.empty((room, n, n))
     )  # fmt: skip
     made, at = 0, 0
     for t in range(num):
-        have, total = 0, 0.0
+        have, total, missing = 0, 0.0, 0.0
         for c in range(offset[t], offset[t + 1]):
             value = free[t] * existence[t] * weight[c] * (1.0 - detection[c]) / missed[t]
-            total += value
+            missing += value
             if value > SMALL:
                 w[have], k[have] = value, kind[c]
                 m[have], V[have] = mean[c], P[c]
                 have += 1
+        total = missing
         for p in range(pair_offset[t], pair_offset[t + 1]):
             e, c = pair_entry[p], pair_component[p]
             value = taken[e] * pair_share[p] / ratio[e] if ratio[e] > 0.0 else 0.0
@@ -381,6 +383,10 @@ def update(  # type: ignore[no-untyped-def]
             have, w, k, num_kinds, m, V, state_period, least, merge, most, at, out_w, out_kind, out_mean, out_P
         )
         source[made], out_existence[made], out_offset[made + 1] = t, min(total, 1.0), at
+        shown[made], surest = -1, missing
+        for e in range(table_offset[t], table_offset[t + 1]):
+            if taken[e] > surest:
+                shown[made], surest = measurement[e], taken[e]
         made += 1
     W = np.empty((d, n))
     for b in range(born):
@@ -403,10 +409,11 @@ def update(  # type: ignore[no-untyped-def]
             have, w, k, num_kinds, m, V, state_period, least, merge, most, at, out_w, out_kind, out_mean, out_P
         )
         source[made], out_existence[made], out_offset[made + 1] = -1 - j, first_existence[j], at
+        shown[made] = j
         made += 1
     facts = (log_partition + np.log(intensity).sum(), loopy, left_out)
     return (
-        source[:made], out_existence[:made], out_offset[: made + 1],
+        source[:made], shown[:made], out_existence[:made], out_offset[: made + 1],
         out_w[:at].copy(), out_kind[:at].copy(), out_mean[:at].copy(), out_P[:at].copy(), facts,
     )  # fmt: skip
 

@@ -124,7 +124,8 @@ def _tracks(
 ) -> Tracks:
     """All that was told, labels counted from 0 in the order of their first appearance."""
     size = [len(objects.label) for objects in told]
-    rows = [np.concatenate(parts) for parts in zip(*told, strict=True)]
+    *parts, shown = zip(*told, strict=True)
+    rows = [np.concatenate(part) for part in parts]
     _, first, which = np.unique(rows[0], return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
@@ -136,6 +137,7 @@ def _tracks(
         mean=rows[2],
         covariance=rows[3],
         kind=rows[4],
+        measurement=None if shown[0] is None else np.concatenate(shown),
         names=model.names,
         kind_names=model.kind_names,
         sensor=tuple(scan.sensor for scan in scans),

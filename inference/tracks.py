@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 COUNT = "count"  # the site: the number of objects at each scan
-ARRAYS = ("time", "offset", "label", "existence", "mean", "covariance", "kind")
+ARRAYS = ("time", "offset", "label", "existence", "mean", "covariance", "kind", "measurement")
 NUM_DRAWS = 1000  # of the number of objects
 
 
@@ -28,6 +28,7 @@ class Objects(NamedTuple):
     mean        (n, d)
     covariance  (n, d, d)
     kind        (n, C)
+    measurement (n,), None from engines that do not say
     """
 
     label: Ints
@@ -35,6 +36,7 @@ class Objects(NamedTuple):
     mean: Floats
     covariance: Floats
     kind: Floats
+    measurement: Ints | None = None
 
 
 class Trajectory(NamedTuple):
@@ -71,6 +73,8 @@ class Tracks(Posterior):
     mean        (R, d) of the state given that the object exists
     covariance  (R, d, d) the same
     kind        (R, C) probabilities of the kinds given that the object exists
+    measurement (R,) of the scan, which most probably is of the object: -1 where it was more probably missed. Where a
+                scan came late, of the last one by time. None from engines that do not say
     names       (d,) of the state's entries: x, y and others, such as vx, vy, heading, speed, length, width
     kind_names  (C,)
     sensor      (T,) whose scan it was
@@ -95,6 +99,7 @@ class Tracks(Posterior):
     names: tuple[str, ...]
     kind_names: tuple[str, ...]
     sensor: tuple[str, ...]
+    measurement: Ints | None = None
 
     def __post_init__(self) -> None:
         _check(self)
@@ -111,7 +116,7 @@ class Tracks(Posterior):
     def at(self, t: int) -> Objects:
         """What is believed after scan t."""
         rows = slice(self.offset[t], self.offset[t + 1])
-        return Objects(self.label[rows], self.existence[rows], self.mean[rows], self.covariance[rows], self.kind[rows])
+        return Objects(**{name: values[rows] for name, values in self._by_row().items()})
 
     def confirmed(self, threshold: float = 0.5) -> Tracks:
         """The rows whose existence is above the threshold."""
@@ -120,7 +125,7 @@ class Tracks(Posterior):
             self,
             draws={},
             offset=np.concatenate([[0], np.cumsum(keep)])[self.offset],
-            **{name: getattr(self, name)[keep] for name in ARRAYS[2:]},
+            **{name: values[keep] for name, values in self._by_row().items()},
         )
 
     def trajectories(self, threshold: float = 0.5) -> dict[int, Trajectory]:
@@ -198,11 +203,19 @@ class Tracks(Posterior):
             )
         return rows
 
+    def _by_row(self) -> dict[str, Any]:
+        """Those of them that have a row for each object."""
+        return {name: values for name, values in self._arrays().items() if name in Objects._fields}
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """All that are there."""
+        return {name: getattr(self, name) for name in ARRAYS if getattr(self, name) is not None}
+
     def _contents(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Those of a Posterior, which can be loaded as such, and the tracks."""
         arrays, rest = super()._contents()
         own = {"names": self.names, "kind_names": self.kind_names, "sensor": self.sensor}
-        return arrays | {f"tracks/{name}": getattr(self, name) for name in ARRAYS}, rest | {"tracks": own}
+        return arrays | {f"tracks/{name}": values for name, values in self._arrays().items()}, rest | {"tracks": own}
 
     @staticmethod
     def load(folder: Path) -> Tracks:
@@ -239,6 +252,8 @@ def _check(tracks: Tracks) -> None:
         "covariance": (rows, d, d),
         "kind": (rows, kinds),
     }
+    if tracks.measurement is not None:
+        shapes["measurement"] = (rows,)
     for name, shape in shapes.items():
         if np.shape(getattr(tracks, name)) != shape:
             raise InputError(f"tracks of {num_scans} scans need {name} {shape}, not {np.shape(getattr(tracks, name))}")

@@ -16,8 +16,13 @@ from experiments.run import Job, run, write
 from experiments.scenarios.scene import Scene
 from experiments.tracking_figures import figures
 from experiments.tracking_metrics import counts, metrics
+from inference import lmb
 from inference.posterior import Posterior
 from inference.tracks import ARRAYS, Tracks, rows_by_label
+from models.objects.motion import ConstantVelocity
+from models.objects.scans import Scan
+from models.objects.sensors import Position
+from models.objects.traffic import Kind, Traffic
 from models.program import InputError
 from tests.drawn_tracks import believed, traffic
 
@@ -38,6 +43,7 @@ def unsure(seed: int = 1) -> Tracks:
         names=("x", "y"),
         kind_names=("car", "bicycle", "pedestrian"),
         sensor=("radar",) * 5,
+        measurement=rng.integers(-1, 4, rows),
     )
 
 
@@ -222,3 +228,21 @@ def test_tracks_pass_through_a_run_and_its_report(tmp_path: Path) -> None:
 
 def test_functionals_of_another_posterior_are_none() -> None:
     assert counts(Posterior({"a": np.zeros((1, 3))})) == {}
+
+
+def test_a_filter_says_which_measurement_is_of_which_object() -> None:
+    """Two objects that stand, seen in changing order, one of them missed, and a false alarm."""
+    sensor = Position(name="plots", noise_std=(0.1, 0.1), extent=100.0, clutter=0.1)
+    model = Traffic((sensor,), ConstantVelocity(), (Kind(noise=(0.1, 0.1)),), unseen_density=1e-3)
+    values = [[[0, 0], [50, 0]], [[50, 0], [0, 0]], [[-70, 30], [50, 0]], [[0, 0], [50, 0]]]
+    scans = [Scan("plots", float(t), np.array(z, dtype=float), np.zeros(3)) for t, z in enumerate(values)]
+    tracks = lmb.run(model, scans, faint=0.01)
+    assert tracks.measurement is not None
+    found = [
+        dict(zip(np.round(tracks.at(t).mean[:, 0], -1).tolist(), tracks.at(t).measurement.tolist(), strict=True))
+        for t in range(4)
+    ]
+    assert [some[0.0] for some in found] == [0, 1, -1, 0] and [some[50.0] for some in found] == [1, 0, 1, 1]
+    assert found[2][-70.0] == 0
+    sure = tracks.confirmed(0.5)
+    assert sure.measurement is not None and len(sure.measurement) == len(sure.label)

@@ -1,4 +1,4 @@
-"""A detector of boxes that also says how much it likes each: PointRCNN and its like."""
+"""Detectors of boxes: on laser points, and in the image of a camera."""
 
 from __future__ import annotations
 
@@ -10,73 +10,123 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.objects.motion import Body
-from models.objects.sensors import Placed, RangeBearing, Scalars
+from models.objects.perception import logistic
+from models.objects.sensors import Placed, RangeBearing, Scalars, Sensor, placed
 
 Floats = NDArray[np.float64]
-FALL, NEAR = 0.2, 12.0  # scores of the same object fall by so much to the metre, from here on [m]
+CLOSE = 0.3  # corners behind the camera or nearer to its plane are taken to be here [m]
+
+
+def seen_from(body: Body, at: Scalars, ops: Any) -> tuple[Any, Any]:
+    """Where a body is in the frame of the sensor: forward and to the left [m]."""
+    dx, dy, cos, sin = body.x - at[0], body.y - at[1], ops.cos(at[2]), ops.sin(at[2])
+    return cos * dx + sin * dy, cos * dy - sin * dx
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoxDetector(RangeBearing):
-    """Range [m] and bearing [rad] of the middle of a box, the axis it lies along (front and back are not told apart
-    [rad]), height of its bottom z, height, width, length [m], and a score, any number that grows with confidence.
+class BoxSensor(Sensor):
+    """What such detectors share: an object that is partly in the image may be seen.
 
-    noise_std       (8,) at score 0; across the line of sight in metres, not radians
-    sharpening      noise falls with the score s by exp(-sharpening s), but for that of the score itself
-    clutter_density false alarms are uniform in the view with so many to the square metre; their z, sizes and scores
-                    normal: `clutter_shape` (5, 2), mean and standard deviation
+    far         range at which half of the objects are detected that would be nearer by [m]
+    softness    of that range [m]
+    half_width  of an object [m]: detection falls with the share of it that is in view, once a third is out of it
+    """
 
-    The score is an entry of the state: how well an object is liked stays much the same from scan to scan, so that many
-    detections of one object do not count as so many independent opinions."""
-
-    sharpening: float = 0.15
-    clutter_density: float = 2.7e-4
-    clutter_shape: tuple[tuple[float, float], ...] = ((0.0, 1.0),) * 5
-    soft: float = 4.0  # how softly the view ends at its farthest [m]
-    half_width: float = 1.2  # of an object: one that is partly in the image may be seen [m]
-
-    names: ClassVar[tuple[str, ...]] = ("range", "bearing", "axis", "z", "height", "width", "length", "score")
-    reads: ClassVar[tuple[str, ...]] = ("heading", "z", "height", "width", "length", "score")
+    softness: float = 4.0
+    half_width: float = 1.2
 
     @property
     def view_settings(self) -> tuple[float, ...]:
-        return (self.angle / 2, self.reach[1], self.soft, self.half_width)
+        return (self.angle / 2, self.reach[1], self.softness, self.half_width)
 
-    @property
-    def noise_settings(self) -> tuple[float, ...]:
-        return (*self.noise_std, self.sharpening)
+    @staticmethod
+    def view(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Any:
+        half, far, softness, half_width = settings
+        forward, left = seen_from(body, at, ops)
+        distance, bearing = ops.sqrt(forward * forward + left * left + 1e-9), ops.atan2(left, forward + 1e-12)
+        wide = ops.atan2(half_width, distance)
+        inside = ops.fmin(ops.fmax((half + wide - ops.fabs(bearing)) / (2 * wide), 0.0), 1.0)
+        return ops.fmin(1.5 * inside, 1.0) * logistic((far - distance) / softness, ops)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxDetector(BoxSensor):
+    """Range [m] and bearing [rad] of the middle of a box, the axis it lies along (front and back are not told apart
+    [rad]), height z of its lower side in the world, its height, width and length [m].
+
+    clutter_density  false alarms are uniform in the view, so many to the square metre
+    clutter_shape    (4, 2) mean and standard deviation of their z, height, width and length, which are normal"""
+
+    clutter_density: float = 2.7e-4
+    clutter_shape: tuple[tuple[float, float], ...] = ((0.0, 30.0), (1.5, 0.15), (1.6, 0.12), (3.9, 0.45))
+
+    names: ClassVar[tuple[str, ...]] = ("range", "bearing", "axis", "z", "height", "width", "length")
+    reads: ClassVar[tuple[str, ...]] = ("heading", "z", "height", "width", "length")
 
     @staticmethod
     def measure(body: Body, at: Scalars, ops: Any) -> Scalars:
         place = RangeBearing.measure(body, at, ops)
-        score = body.score - FALL * ops.fmax(place[0] - NEAR, 0.0)
-        return (*place, body.heading, body.z, body.height, body.width, body.length, score)
-
-    @staticmethod
-    def spread(z: Scalars, settings: Scalars, ops: Any) -> Scalars:
-        along, across, *rest, score, sharpening = settings
-        factor = ops.exp(-sharpening * z[7])
-        return (along * factor, across * factor / ops.fmax(z[0], 1.0), *(std * factor for std in rest), score)
-
-    @staticmethod
-    def view(body: Body, at: Scalars, settings: Scalars, ops: Any) -> Any:
-        half, far, soft, half_width = settings
-        distance, bearing = RangeBearing.measure(body, at, ops)
-        bearing = ops.atan2(ops.sin(bearing), ops.cos(bearing))
-        wide = half_width / distance
-        inside = ops.fmin(ops.fmax((half + wide - ops.fabs(bearing)) / (2 * wide), 0.0), 1.0)
-        return ops.fmin(1.5 * inside, 1.0) * (0.5 + 0.5 * ops.tanh(0.5 * (far - distance) / soft))
+        return (*place, body.heading - at[2], body.z, body.height, body.width, body.length)
 
     def place(self, values: Floats, noise: Floats, at: Floats) -> Placed:
-        found = super().place(values, noise, at)
-        return found._replace(heading=values[:, 2:3], heading_std=np.sqrt(noise[:, 2, 2]))
+        return placed(values, noise, at)._replace(heading=values[:, 2:3] + at[2], heading_std=np.sqrt(noise[:, 2, 2]))
 
     @property
     def span(self) -> Floats:
         loc, std = np.array(self.clutter_shape).T
-        return np.vstack([super().span, (0.0, math.pi), np.stack([loc - 3 * std, loc + 3 * std], 1)])
+        half = min(self.angle / 2, math.pi)
+        around = [self.reach, (-half, half), (-math.pi / 2, math.pi / 2)]
+        return np.vstack([around, np.stack([loc - 3 * std, loc + 3 * std], 1)])
 
     def clutter_intensity(self, values: Floats) -> Floats:
         loc, std = np.array(self.clutter_shape).T
         log = -0.5 * np.square((values[..., 3:] - loc) / std).sum(-1) - np.log(std * math.sqrt(2 * math.pi)).sum()
-        return self.clutter_density * values[..., 0] / math.pi * np.exp(log)
+        return self.clutter_density / math.pi * values[..., 0] * np.exp(log)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageBox(BoxSensor):
+    """A box in the image: the angles to its left and its right side, left positive [rad], and how tall it is, as the
+    tangent height / distance. It begins no track: where it is says no range well. False alarms are uniform over the
+    view, up to `tallest`.
+
+    blur  share of the tangent that is added to the noise of each: errors grow with the box
+
+    A side that the border of the image cuts off says little: scans give it a large noise of its own."""
+
+    births: bool = False
+    blur: tuple[float, float, float] = (0.05, 0.05, 0.07)
+    tallest: float = 0.5
+
+    names: ClassVar[tuple[str, ...]] = ("left", "right", "tall")
+    reads: ClassVar[tuple[str, ...]] = ("heading", "height", "width", "length")
+
+    @property
+    def noise_settings(self) -> tuple[float, ...]:
+        return (*self.noise_std, *self.blur)
+
+    @staticmethod
+    def measure(body: Body, at: Scalars, ops: Any) -> Scalars:
+        forward, left = seen_from(body, at, ops)
+        cos, sin = ops.cos(body.heading - at[2]), ops.sin(body.heading - at[2])
+        ahead, angles = list[Any](), list[Any]()
+        for along, across in ((0.5, 0.5), (0.5, -0.5), (-0.5, 0.5), (-0.5, -0.5)):
+            u, v = along * body.length, across * body.width
+            ahead.append(ops.fmax(forward + cos * u - sin * v, CLOSE))
+            angles.append(ops.atan2(left + sin * u + cos * v, ahead[-1]))
+        return (_of_all(ops.fmax, angles), _of_all(ops.fmin, angles), body.height / _of_all(ops.fmin, ahead))
+
+    @staticmethod
+    def spread(z: Scalars, settings: Scalars, ops: Any) -> Scalars:
+        return tuple(std + blur * ops.fabs(z[2]) for std, blur in zip(settings[:3], settings[3:], strict=True))
+
+    @property
+    def span(self) -> Floats:
+        half = min(self.angle / 2, math.pi / 2)
+        return np.array([(-half, half), (-half, half), (0.0, self.tallest)])
+
+
+def _of_all(pick: Any, four: list[Any]) -> Any:
+    """The most or the least of four."""
+    a, b, c, d = four
+    return pick(pick(a, b), pick(c, d))

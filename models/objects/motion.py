@@ -49,7 +49,6 @@ class Body(NamedTuple):
     width: Any = None
     height: Any = None
     z: Any = None
-    score: Any = None
 
 
 @dataclass(frozen=True)

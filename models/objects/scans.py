@@ -22,8 +22,8 @@ class Scan(NamedTuple):
     values    (M, d) as the sensor measures
     pose      (3,) of the car in the world then: x, y [m], heading [rad]
     noise     (M, d, d) covariances, None for those of the sensor
-    score     (M,) what the detector thinks of each: the probability that it is no false alarm, unless the sensor
-              says otherwise; None where it has no opinion
+    score     (M,) what the detector thinks of each: the probability that it is no false alarm; None where it has no
+              opinion
     likeness  (M, C) p(looks of the measurement | kind), up to a factor by measurement; None where it shows no kind
     """
 
@@ -42,12 +42,11 @@ class Recording(NamedTuple):
     scans: tuple[Scan, ...]
 
 
-def check_scan(scan: Scan, names: Sequence[str], num_kinds: int, *, probabilities: bool = True) -> Scan:
+def check_scan(scan: Scan, names: Sequence[str], num_kinds: int) -> Scan:
     """The scan, its numbers as arrays of float64. A scan without measurements is one, too.
 
     names          of what its sensor measures
     num_kinds      of objects, for its likeness
-    probabilities  whether its scores are
 
     Raises InputError naming sensor, time, value and what to do: for a time, a pose, values, covariances, scores or a
     likeness that are not finite, of another shape than they should be, or out of their range."""
@@ -84,7 +83,7 @@ def check_scan(scan: Scan, names: Sequence[str], num_kinds: int, *, probabilitie
             )
     if score is not None:
         score = numbers("scores", score, (num,))
-        if probabilities and (wrong := (score < 0.0) | (score > 1.0)).any():
+        if (wrong := (score < 0.0) | (score > 1.0)).any():
             raise InputError(
                 f"{where} has the score {score[wrong][0]:g}, but scores are probabilities; calibrate them into [0, 1]"
             )

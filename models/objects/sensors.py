@@ -72,7 +72,6 @@ class Sensor:
 
     names: ClassVar[tuple[str, ...]] = ()
     reads: ClassVar[tuple[str, ...]] = ()  # of Body, what not every motion has
-    scores_are_probabilities: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if len(self.noise_std) != len(self.names) or not all(s > 0.0 for s in self.noise_std):
@@ -258,6 +257,16 @@ class Position(Sensor):
         return np.add(self.middle, self.extent * np.array([[-1.0, -1.0], [1.0, 1.0]])).T
 
 
+def placed(values: Floats, noise: Floats, at: Floats) -> Placed:
+    """Where range and bearing, the first of what is measured (M, d), are in the world."""
+    distance, angle = values[:, 0], values[:, 1] + at[2]
+    cos, sin = np.cos(angle), np.sin(angle)
+    slope, position = np.empty((len(values), 2, 2)), np.empty((len(values), 2))
+    slope[:, 0, 0], slope[:, 0, 1], slope[:, 1, 0], slope[:, 1, 1] = cos, -distance * sin, sin, distance * cos
+    position[:, 0], position[:, 1] = at[0] + distance * cos, at[1] + distance * sin
+    return Placed(position, slope @ noise[:, :2, :2] @ slope.swapaxes(-1, -2))
+
+
 @dataclass(frozen=True, kw_only=True)
 class RangeBearing(Sensor):
     """Range [m] and bearing [rad] of the middle of an object, from the sensor."""
@@ -270,12 +279,7 @@ class RangeBearing(Sensor):
         return (ops.sqrt(dx * dx + dy * dy + 1e-9), ops.atan2(dy, dx) - at[2])
 
     def place(self, values: Floats, noise: Floats, at: Floats) -> Placed:
-        distance, angle = values[:, 0], values[:, 1] + at[2]
-        cos, sin = np.cos(angle), np.sin(angle)
-        slope, position = np.empty((len(values), 2, 2)), np.empty((len(values), 2))
-        slope[:, 0, 0], slope[:, 0, 1], slope[:, 1, 0], slope[:, 1, 1] = cos, -distance * sin, sin, distance * cos
-        position[:, 0], position[:, 1] = at[0] + distance * cos, at[1] + distance * sin
-        return Placed(position, slope @ noise[:, :2, :2] @ slope.swapaxes(-1, -2))
+        return placed(values, noise, at)
 
     @property
     def span(self) -> Floats:

@@ -16,7 +16,6 @@ whoever comes later comes as others go, or from places.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -247,7 +246,7 @@ class Traffic:
         for scan in scans:
             scan = scan.scan if isinstance(scan, ScanFrame) else scan
             sensor = self.sensor(scan)
-            found.append(check_scan(scan, sensor.names, len(self.kinds), probabilities=sensor.scores_are_probabilities))
+            found.append(check_scan(scan, sensor.names, len(self.kinds)))
         return tuple(found)
 
     def __call__(self, frames: Sequence[ScanFrame]) -> None:
@@ -297,7 +296,7 @@ class Traffic:
         parts = objects.components
         if sensor.occlusion == 0.0 or not len(objects.label):
             return np.zeros(1)
-        best = np.array([a + parts.weight[a:b].argmax() for a, b in itertools.pairwise(parts.offset)])
+        best = np.lexsort((parts.weight, parts.group))[parts.offset[1:] - 1]
         place = np.concatenate([parts.mean[:, :2], more.mean[:, :2]])
         kind = np.concatenate([parts.kind, more.kind])
         x = np.empty((len(place), len(best), 4))

@@ -1,0 +1,61 @@
+"""Scores of a filter on a sequence of KITTI: (posterior, scene) -> {name: value}."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from experiments.kitti_evaluation import evaluate
+from experiments.kitti_existence import Candidates, candidates, fit_all, report
+from experiments.scenarios.junction import DATA_ROOT
+from experiments.scenarios.kitti_scans import CAMERA, KittiTruth, kitti_scans
+from experiments.scenarios.kitti_tracking import sequences
+from experiments.scenarios.scene import Scene
+from inference.posterior import Posterior
+from inference.tracks import Tracks
+from models.objects.traffic import Traffic
+
+KEPT = ("mota", "hota", "idf1", "ids", "frag", "recall", "precision")
+
+
+def followed(
+    traffic: Traffic, follow: Callable[..., Tracks], sequence: str, *, camera: bool = False, data_root: str = DATA_ROOT
+) -> tuple[KittiTruth, Candidates, Tracks]:
+    """What a filter holds possible in a sequence."""
+    scene = kitti_scans(sequence, camera, data_root)
+    tracks = follow(traffic, scene.data.scans)
+    return scene.truth, candidates(tracks, scene.data.scans, scene.truth.sequence), tracks
+
+
+def metrics(
+    posterior: Posterior, scene: Scene, *, traffic: Traffic, follow: Callable[..., Tracks], data_root: str = DATA_ROOT
+) -> dict[str, float]:
+    """experiments.kitti_evaluation of the boxes that the filter reports, and the median time of a frame [ms]. Existence
+    is calibrated (experiments.kitti_existence) on all other sequences that are there: the filter `follow` runs on each
+    of them. Nothing without tracks of a sequence of KITTI."""
+    if not isinstance(posterior, Tracks) or not isinstance(scene.truth, KittiTruth):
+        return {}
+    own, camera = scene.truth.sequence, CAMERA in posterior.sensor
+    others = [
+        followed(traffic, follow, name, camera=camera, data_root=data_root)
+        for name in sequences(data_root)
+        if name != own.name
+    ]
+    calibration = fit_all([truth for truth, _, _ in others], [found for _, found, _ in others])
+    boxes = report(candidates(posterior, scene.data.scans, own), calibration)
+    scores = evaluate([scene_of(scene.truth)], [boxes], average=False)
+    ms = 1e3 * float(np.median(frame_seconds(posterior)))
+    return {f"kitti_{name}": scores[name] for name in KEPT} | {"kitti_ms_per_frame": ms}
+
+
+def scene_of(truth: KittiTruth) -> Scene:
+    """The sequence beside its labels, as the evaluation reads them."""
+    return Scene(truth.sequence, truth.labels, f"KITTI {truth.sequence.name}", {})
+
+
+def frame_seconds(tracks: Tracks) -> Any:
+    """(T,) that the filter took for all scans of each frame [s]."""
+    frame = np.unique(tracks.time, return_inverse=True)[1]
+    return np.bincount(frame, tracks.info["step_seconds"])

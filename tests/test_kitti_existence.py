@@ -1,0 +1,199 @@
+"""Calibrated existence: made-up rows whose truth is known, histories by hand, and the real sequences where they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from benchmarks import kitti_tracking as benchmark
+from experiments.kitti_boxes import image_boxes
+from experiments.kitti_existence import (
+    Candidates,
+    Past,
+    candidates,
+    fit,
+    fit_all,
+    labelled,
+    leave_one_out,
+    past_of,
+    report,
+)
+from experiments.kitti_matching import TrackBoxes
+from experiments.scenarios.kitti_scans import CAMERA, LASER, KittiTruth, scans_of
+from experiments.scenarios.kitti_tracking import CameraBoxes, Detections
+from inference.tracks import Tracks
+from models.objects.box_detector import BoxDetector, ImageBox
+from models.objects.motion import ConstantTurn
+from models.objects.scans import Scan
+from models.objects.sensors import sensor_formulas
+from models.program import InputError
+from tests.drawn_cars import IMAGE, PROJECTION, car, scene
+
+
+def tracks_of(rows: list[tuple[int, int, int]], sensor: tuple[str, ...], time: np.ndarray) -> Tracks:
+    """Rows (scan, label, measurement)."""
+    scan, label, measurement = np.array(rows, dtype=np.int64).reshape(-1, 3).T
+    num, d = len(rows), 4
+    return Tracks(
+        time=time,
+        offset=np.searchsorted(scan, np.arange(len(time) + 1)),
+        label=label,
+        existence=np.full(num, 0.5),
+        mean=np.zeros((num, d)),
+        covariance=np.tile(np.eye(d), (num, 1, 1)),
+        kind=np.ones((num, 1)),
+        names=("x", "y", "vx", "vy"),
+        kind_names=("car",),
+        sensor=sensor,
+        measurement=measurement,
+    )
+
+
+def test_histories_are_those_of_each_object_and_each_sensor() -> None:
+    sensor, time = (LASER, CAMERA, LASER, CAMERA, LASER), np.array([0.0, 0.0, 0.1, 0.1, 0.2])
+    rows = [(0, 7, 1), (0, 9, -1), (1, 7, 0), (2, 7, -1), (2, 9, 0), (3, 7, -1), (4, 7, 0)]
+    logits = np.array([[1.0, 3.0], [0.0, 0.0], [2.0, 0.0], [0.0, 0.0], [-1.0, 0.0]])
+    scans = [
+        Scan(name, t, np.zeros((2, 2)), np.zeros(3), score=expit(own) if name == LASER else None)
+        for name, t, own in zip(sensor, time, logits, strict=True)
+    ]
+    laser = past_of(tracks_of(rows, sensor, time), scans, LASER)
+    seven = [0, 2, 3, 5, 6]
+    expected = Past(
+        hits=np.array([1.0, 1, 1, 1, 2]),
+        misses=np.array([0.0, 0, 1, 1, 0]),
+        mean=np.array([3.0, 3, 3, 3, 1]),
+        most=np.array([3.0, 3, 3, 3, 3]),
+        last=np.array([3.0, 3, 0, 0, -1]),
+        faded=np.array([1.5, 1.5, 1.5, 1.5, 0.85 * 1.5 - 0.5]),
+    )
+    for name, found, wanted in zip(Past._fields, laser, expected, strict=True):
+        np.testing.assert_allclose(found[seven], wanted, atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(laser.hits[[1, 4]], [0, 1])
+    np.testing.assert_allclose(laser.misses[[1, 4]], [1, 0])
+    camera = past_of(tracks_of(rows, sensor, time), scans, CAMERA)
+    np.testing.assert_allclose(camera.hits[seven], [0, 1, 1, 1, 1])
+    np.testing.assert_allclose(camera.misses[seven], [0, 0, 0, 1, 1])
+
+
+def test_a_calibration_finds_the_weights_that_made_the_labels() -> None:
+    rng = np.random.default_rng(3)
+    a = rng.normal(2.0, 3.0, (20_000, 2))
+    w = np.array([0.5, 1.0, -2.0])
+    y = rng.random(len(a)) < expit(np.concatenate([np.ones((len(a), 1)), (a - 2.0) / 3.0], 1) @ w)
+    found = fit(a, y)
+    np.testing.assert_allclose(found.weights, w, atol=0.12)  # 4 standard errors of about 0.03
+    p = found.probability(a)
+    for low in (0.1, 0.4, 0.7):
+        some = (p > low) & (p < low + 0.2)
+        assert y[some].mean() == pytest.approx(p[some].mean(), abs=4 * 0.5 / np.sqrt(some.sum()))
+    far = found.probability(np.array([[1e6, 2.0], [11.0, 2.0]]))
+    assert far[0] == pytest.approx(far[1], abs=0.02)  # features are bounded at 3 standard deviations
+    with pytest.raises(InputError, match="give more sequences"):
+        fit(a, np.ones(len(a), dtype=bool))
+
+
+def made_up(seed: int) -> tuple[KittiTruth, Candidates]:
+    """A car that stands, and something beside it that looks less like one; the feature says which, not surely."""
+    rng, frames = np.random.default_rng(seed), 40
+    whole = scene([(t, 0, car(-3.0)) for t in range(frames)], frames)
+    box = np.array([car(-3.0), car(3.0)] * frames)
+    boxes = TrackBoxes(2 * np.arange(frames + 1), np.tile([5, 6], frames), box, np.full(2 * frames, 0.5))
+    feature = np.tile([1.0, -1.0], frames) + rng.normal(0.0, 0.5, 2 * frames)
+    return KittiTruth(whole.data, whole.truth), Candidates(boxes, feature[:, None], np.ones(2 * frames, dtype=bool))
+
+
+def test_labels_confirm_what_they_overlap_and_leave_out_what_is_small() -> None:
+    truth, found = made_up(0)
+    confirmed, counts = labelled(truth, found.boxes)
+    np.testing.assert_array_equal(confirmed, np.tile([True, False], 40))
+    assert counts.all()
+    far = found.boxes._replace(box=np.array([car(-3.0), car(3.0, 60.0)] * 40))
+    assert (image_boxes(far.box[1:2], PROJECTION, IMAGE)[0] @ [0, -1, 0, 1]) < 25.0
+    confirmed, counts = labelled(truth, far)
+    np.testing.assert_array_equal(counts, np.tile([True, False], 40))
+    vans = KittiTruth(truth.sequence, truth.labels._replace(kind=np.full(40, "Van")))
+    assert not labelled(vans, found.boxes)[1][::2].any()
+
+
+def test_a_sequence_is_judged_by_what_the_others_taught() -> None:
+    truths, found = zip(*(made_up(seed) for seed in range(3)), strict=True)
+    told = leave_one_out(truths, found)
+    by_hand = report(found[0], fit_all(truths[1:], found[1:]))
+    np.testing.assert_array_equal(told[0].score, by_hand.score)
+    # its own labels change nothing of what is told of it
+    lied = truths[0]._replace(labels=truths[0].labels._replace(kind=np.full(40, "Van")))
+    again = leave_one_out([lied, *truths[1:]], found)
+    np.testing.assert_array_equal(again[0].score, told[0].score)
+    assert not np.array_equal(again[1].score, told[1].score)
+    assert (told[0].track == 5).mean() > 0.8
+
+
+def test_reports_go_on_until_a_track_is_clearly_gone() -> None:
+    _, found = made_up(0)
+    truths, others = zip(*(made_up(seed) for seed in range(1, 3)), strict=True)
+    calibration = fit_all(truths, others)
+    p = calibration.probability(found.features)
+    for label, rows in ((5, slice(0, None, 2)), (6, slice(1, None, 2))):
+        telling, expected = False, []
+        for value in p[rows]:
+            telling = value > (0.3 if telling else 0.7)
+            expected.append(telling)
+        told = report(found, calibration, on=0.7, off=0.3)
+        frame = np.repeat(np.arange(40), np.diff(told.offset))[told.track == label]
+        np.testing.assert_array_equal(frame, np.flatnonzero(expected))
+    hidden = report(found._replace(shown=np.zeros(80, dtype=bool)), calibration)
+    assert len(hidden.track) == 0 and hidden.offset[-1] == 0
+
+
+def test_tracks_that_do_not_say_what_they_were_seen_by_are_refused() -> None:
+    truth, _ = made_up(0)
+    tracks = tracks_of([(0, 0, 0)], (LASER,), np.array([0.0]))
+    with pytest.raises(InputError, match="are not of sequence made up"):
+        candidates(tracks, [], truth.sequence)
+    silent = replace(tracks, measurement=None)
+    with pytest.raises(InputError, match="choose engine=lmb"):
+        past_of(silent, [Scan(LASER, 0.0, np.zeros((0, 2)), np.zeros(3))], LASER)
+
+
+def test_scans_of_a_sequence_are_in_order_and_a_frame_without_boxes_has_one() -> None:
+    sequence = scene([(0, 0, car())], 3).data
+    scans = scans_of(sequence, camera=True)
+    assert [scan.sensor for scan in scans] == [LASER, CAMERA] * 3
+    assert [scan.values.shape for scan in scans[:2]] == [(0, 7), (0, 3)]
+    assert [scan.time for scan in scans_of(sequence)] == list(sequence.time)
+
+
+def test_the_benchmark_skips_with_a_reason_where_there_are_no_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(benchmark, "DATA", "nowhere")
+    for measurement in benchmark.MEASUREMENTS:
+        for key, value in measurement.measure(benchmark.Effort()).items():
+            assert value.value is None and "data_root" in value.detail, key
+
+
+def test_scans_are_what_the_sensors_measure_of_a_box() -> None:
+    """Detections laid over labels: a car that is turned, one that the border cuts off."""
+    label = scene([(0, 0, car(-3.0, 20.0, 0.4)), (0, 1, car(9.5, 10.0, 1.3))], 1)
+    whole, pose = label.truth, label.data.pose.copy()
+    image = np.clip(whole.image, 0.0, np.array([1241.0, 374.0, 1241.0, 374.0]))
+    nothing = np.array([0, 2])
+    seen = Detections(nothing, whole.position, whole.heading, whole.size, np.array([2.0, 7.0]), image, whole.camera)
+    sequence = label.data._replace(pose=pose, detections=seen, camera_boxes=CameraBoxes(nothing, image, np.ones(2)))
+    laser, camera = scans_of(sequence, camera=True)
+    motion = ConstantTurn(("z", "height", "width", "length"), accelerates=False)
+    x = np.zeros((2, 9))
+    x[:, :2], x[:, 2], x[:, 5], x[:, 6:] = whole.position[:, :2], whole.heading, whole.position[:, 2], whole.size
+    for scan, sensor, rows in ((laser, BoxDetector, [0, 1]), (camera, ImageBox, [0])):
+        measure, _ = sensor_formulas(motion, sensor, 0)  # type: ignore[arg-type]
+        found = measure(x, scan.pose[None])
+        exact = found[rows] if sensor is BoxDetector else found[rows][:, :2]
+        np.testing.assert_allclose(scan.values[rows][:, : exact.shape[1]], exact, atol=1e-6)
+    assert camera.values[0, 2] == pytest.approx(1.5 / 18.0, rel=0.1)  # of the nearest corner
+    np.testing.assert_allclose(laser.score, [0.5, expit(0.85 * 5.0)])
+    std = np.sqrt(np.diagonal(laser.noise, 0, 1, 2))
+    np.testing.assert_allclose(std[1] * [1, laser.values[1, 0], 1, 1, 1, 1, 1], [0.12, 0.07, 0.05, 0.08, 0.1, 0.1, 0.3])
+    np.testing.assert_allclose(std[0, 2:] / std[1, 2:], np.exp(0.15 * 5.0))
+    assert (np.diagonal(camera.noise, 0, 1, 2)[1] == 1.0).tolist() == [False, True, False]  # cut off at the right

@@ -4,9 +4,9 @@
     jpda   the same, joint probabilistic data association (efficient hypothesis management, EHM2)
     phd    Gaussian-mixture probability hypothesis density filter; newcomers from the model's places alone
 
-Targets of gnn and jpda begin at measurements that no target explains: held back until `hits` measurements came, dropped
-after `held` scans without one, later after `misses`. Measurements farther than `near` from where a target is predicted
-are left out by a k-d tree before anything is computed of them: Stone Soup's own, without which the same comes out later.
+Targets of gnn and jpda begin at measurements that no target explains: held back until `hits` measurements came,
+dropped after `held` scans without one, later after `misses`. Stone Soup's k-d tree leaves out measurements farther than
+`near` from where a target is predicted before anything is computed of them: without it the same comes out later.
 
 What moves and what is seen is the model's: one kind of constant velocity, one sensor of positions.
 """

@@ -168,11 +168,14 @@ def summed(components: Components, values: Floats) -> Floats:
     return out
 
 
-def posterior(components: Components, known: Fit, detection: Floats, theta: Ints, keep: Any, least: float) -> Components:
+def posterior(
+    components: Components, known: Fit, detection: Floats, theta: Ints, keep: Any, least: float
+) -> Components:
     """The instances to keep, each given its measurement or that it has none."""
     group = components.group
     j, each = theta[group], np.arange(len(group))
-    weight, mean, covariance = components.weight * (1.0 - detection), components.mean.copy(), components.covariance.copy()
+    weight = components.weight * (1.0 - detection)
+    mean, covariance = components.mean.copy(), components.covariance.copy()
     hit = j != MISSED
     weight[hit] = known.share[each[hit], j[hit]]
     mean[hit], covariance[hit] = known.mean[each[hit], j[hit]], known.covariance[each[hit], j[hit]]

@@ -17,11 +17,11 @@ from inference.progress import Progress
 from inference.tracks import Tracks
 
 SETTINGS: dict[tuple[str, int], dict[str, Any]] = {
-    ("gnn", 30): {"hits": 4, "gate": 3.0, "misses": 2, "held": 1},
-    ("jpda", 30): {"hits": 4, "gate": 3.0, "misses": 2, "held": 1},
+    ("gnn", 30): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
+    ("jpda", 30): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
     ("phd", 30): {"merge": 16.0, "gate": 5.0, "prune": 1e-4},
-    ("gnn", 66): {"hits": 4, "gate": 3.0, "misses": 2, "held": 1},
-    ("jpda", 66): {"hits": 4, "gate": 3.0, "misses": 2, "held": 1},
+    ("gnn", 66): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
+    ("jpda", 66): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
 }
 NAMES = {"gnn": "GNN", "jpda": "JPDA-EHM2", "phd": "GM-PHD"}
 
@@ -38,8 +38,8 @@ def scores(clutter: int, places: bool, effort: Effort) -> dict[str, Score]:
     """Of our filter, "lmb", and of all trackers with the same knowledge of where targets come from."""
     from experiments.stonesoup_engine import run
 
-    model, runs = plots(clutter, places=places), dict[str, list[Tracks]]()
-    scenes = [crossing_targets(seed, clutter) for seed in range(effort.peers)]
+    model, runs = plots(float(clutter), places=places), dict[str, list[Tracks]]()
+    scenes = [crossing_targets(seed, float(clutter)) for seed in range(effort.peers)]
     trackers = [t for t, c in SETTINGS if c == clutter and (t == "phd") == places]
     lmb()(model, scenes[0].data.scans)  # compiles
     with Progress(f"clutter {clutter}", len(scenes) * len(trackers), effort.show) as bar:

@@ -20,8 +20,8 @@ SETTINGS: dict[tuple[str, int], dict[str, Any]] = {
     ("gnn", 30): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
     ("jpda", 30): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
     ("phd", 30): {"merge": 16.0, "gate": 5.0, "prune": 1e-4},
-    ("gnn", 66): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
-    ("jpda", 66): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
+    ("gnn", 66): {"hits": 5, "gate": 4.0, "misses": 2, "held": 1},
+    ("jpda", 66): {"hits": 5, "gate": 4.0, "misses": 2, "held": 1},
 }
 NAMES = {"gnn": "GNN", "jpda": "JPDA-EHM2", "phd": "GM-PHD"}
 
@@ -50,7 +50,7 @@ def scores(clutter: int, places: bool, effort: Effort) -> dict[str, Score]:
                 runs.setdefault(tracker, []).append(run(model, scene.data.scans, tracker=tracker, **settings))  # type: ignore[arg-type]
                 bar.advance(1)
     return {
-        name: Score(list(map(ospa_m, own, scenes, strict=True)), float(np.median(step_ms(own))))  # type: ignore[call-overload]
+        name: Score([ospa_m(*pair) for pair in zip(own, scenes, strict=True)], float(np.median(step_ms(own))))
         for name, own in runs.items()
     }
 

@@ -143,9 +143,9 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
         Bernoullis(label[keep], np.ones(keep.sum()), old),
         Bernoullis(number * lmb.STRIDE + free, np.ones(len(free)), fresh),
     )
-    counts = (np.concatenate(pair) for pair in ((hits[keep], ones), (looks[keep], ones), (vain[keep], 0 * ones)))
+    hits, looks, vain = (np.append(a[keep], b) for a, b in ((hits, ones), (looks, ones), (vain, 0 * ones)))
     last, sure = np.append(last[keep], scan.time * ones), np.append(sure[keep], ones * knobs.hits <= 1)
-    return Belief(scan.time, after, *counts, last, sure), Facts(log_factor)
+    return Belief(scan.time, after, hits, looks, vain, last, sure), Facts(log_factor)
 
 
 def predict(model: HasObjects, belief: Belief, now: float, number: int) -> Belief:

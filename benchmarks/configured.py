@@ -13,10 +13,12 @@ from inference.posterior import Posterior
 def configured(group: str, name: str) -> Any:
     """What the config GROUP=NAME makes: a model, or an engine that waits for its arguments."""
     from hydra import compose, initialize_config_module
-    from hydra.utils import instantiate
+    from omegaconf import OmegaConf
+
+    from experiments.schema import build
 
     with initialize_config_module("configs", version_base="1.3"):
-        return instantiate(compose("run", [f"{group}={name}"])[group], _convert_="all")
+        return build(OmegaConf.to_container(compose("run", [f"{group}={name}"])[group], resolve=True), group)
 
 
 def quiet_engine(name: str, **knobs: Any) -> Callable[..., Posterior]:

@@ -5,9 +5,11 @@ nothing where it makes no sense. So the same draw, or another of known probabili
 
     birth     draws g_1, then g_2 ~ N(. | g_1), ..., as many as a geometric number says. If all are false alarms they
               become a track; if they are one, all of it, they become false alarms. Death is the same draw: ratio 1
+    extend    draws g, g_1, ... likewise. If g is the last of a track and the others are false alarms, they follow it; if
+              they are all that follows it, they become false alarms: ratio 1
     attach    draws g, then h ~ B(. | g). If g is a false alarm and h of a track without a measurement in g's scan, g
               joins it; if both are of one track, g leaves it. Before and after, h may be any other measurement of the
-              track: ratio 1. It extends a track, reduces it, and fills or makes a gap
+              track: ratio 1. It extends a track or reduces it by one, and fills or makes a gap
     exchange  draws g, then k of the same scan: each takes the other's place, in tracks or among false alarms. The same
               pair leads back: ratio 1. It updates one assignment, or two
     relink    draws g, then h ~ N(. | g), or the end of the track ("none"). With n what follows g in its track, and p
@@ -22,6 +24,7 @@ A share DEFENCE of every partner is drawn uniformly from all measurements, so th
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -38,10 +41,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Owner = Mapping[int, Track]  # the track of each measurement that is in one
 
-NAMES = ("birth", "attach", "exchange", "relink")
-SHARES = (0.2, 0.3, 0.2, 0.3)
+NAMES = ("birth", "extend", "attach", "exchange", "relink")
+SHARES = (0.15, 0.15, 0.2, 0.2, 0.3)
 DEFENCE = 0.05
-LONGER = 0.5  # share of births that go on after each measurement
+LONGER = 0.7  # share of births and extensions that go on after each measurement
 CUT = 0.2  # share of relinks that split
 
 
@@ -155,14 +158,14 @@ def _same(window: Window) -> Partners:
 def propose(owner: Owner, window: Window, by: Proposals, move: int, rng: np.random.Generator) -> Edit | None:
     """What a move of NAMES draws; None where it makes no sense."""
     g = int(rng.random() * len(window.scan))
-    if move == 0:
-        sequence = [g]
+    if move < 2:
+        sequence = [g] if move == 0 else [g, by.later.draw(g, rng)]
         while rng.random() < LONGER:
             sequence.append(by.later.draw(sequence[-1], rng))
-        return birth(owner, window.scan, tuple(sequence))
-    if move == 1:
-        return attach(owner, window.scan, g, by.near.draw(g, rng))
+        return (birth, extend)[move](owner, window.scan, tuple(sequence))
     if move == 2:
+        return attach(owner, window.scan, g, by.near.draw(g, rng))
+    if move == 3:
         return exchange(owner, window.scan, g, by.same.draw(g, rng))
     return relink(owner, window.scan, g, None if rng.random() < CUT else by.later.draw(g, rng), by.later)
 
@@ -171,8 +174,24 @@ def birth(owner: Owner, scan: Ints, sequence: Track) -> Edit | None:
     """A track of false alarms, or false alarms of a track."""
     if owner.get(sequence[0]) == sequence:
         return Edit((sequence,), ())
-    rising = all(scan[a] < scan[b] for a, b in zip(sequence, sequence[1:], strict=False))
-    return Edit((), (sequence,)) if rising and not any(g in owner for g in sequence) else None
+    return Edit((), (sequence,)) if _rise(scan, sequence) and not any(g in owner for g in sequence) else None
+
+
+def extend(owner: Owner, scan: Ints, sequence: Track) -> Edit | None:
+    """False alarms to the end of a track, or the end of a track to false alarms; the first stays in the track."""
+    mine, more = owner.get(sequence[0]), sequence[1:]
+    if mine is None:
+        return None
+    head = mine[: mine.index(sequence[0]) + 1]
+    if mine == head + more:
+        return Edit((mine,), (head,))
+    free = mine == head and not any(g in owner for g in more)
+    return Edit((mine,), (mine + more,)) if free and _rise(scan, sequence) else None
+
+
+def _rise(scan: Ints, sequence: Track) -> bool:
+    """Whether each measurement is of a later scan than the one before."""
+    return all(scan[a] < scan[b] for a, b in itertools.pairwise(sequence))
 
 
 def attach(owner: Owner, scan: Ints, g: int, h: int) -> Edit | None:

@@ -7,7 +7,7 @@ For one component of a track (its kind, the heading it came with), with its meas
 by Gauss and Newton: f and h are linearised at the states found last, at first at those of the filter, and the linear
 problem is solved by Kalman's filter and the pass of Rauch, Tung and Striebel (1965) back:
 
-    x_s <- m_s + A (x_(s+1) - f m_s),   P_s <- P_s + A (P_(s+1) - (F P_s F' + L L')) A',   A = P_s F' (F P_s F' + L L')^-1
+    x_s <- m_s + A (x_(s+1) - f(m_s)),   P_s <- P_s + A (P_(s+1) - M) A',   A = P_s F' M^-1,   M = F P_s F' + L L'
 
 This is the iterated extended Kalman smoother (Bell 1994). R and L are those at the last states, and that p_D and
 survival depend on the state is left out. It is exact at once where the model is linear.
@@ -30,7 +30,7 @@ from inference.lmb import LONGEST, Knobs
 from inference.lmb_association import associate
 from inference.lmb_kernel import propagate
 from inference.track_kernel import see
-from inference.track_weight import Track, Window, follow, window_of
+from inference.track_weight import Track, Window, follow, picked, window_of
 from inference.tracking import require_objects
 from inference.tracks import Tracks
 from models.multi_object import Components, HasObjects, Moved, no_objects
@@ -84,11 +84,11 @@ def smooth(
     (trail,) = follow(model, window, [track], [None], gate=math.inf)
     weight = trail.rows[-1].weight
     best = int(weight.argmax())
-    kind = np.bincount(trail.kind, weight, len(model.kind_names))
+    kind = np.bincount(trail.kind, weight, len(model.kind_names)).astype(np.float64)
     first = int(window.scan[track[0]])
     prior = window.prior[first]
     start = int(prior.offset[track[0] - window.offset[first]]) + best
-    begin = Components(ONE, np.ones(1), *(values[start : start + 1] for values in prior[2:]))
+    begin = picked(prior, [start], ONE)
     nodes = _nodes(window, track)
     forward = _filter(model, window, nodes, begin, None)
     mean, covariance = _back(forward, model.period)

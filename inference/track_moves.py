@@ -5,8 +5,8 @@ nothing where it makes no sense. So the same draw, or another of known probabili
 
     birth     draws g_1, then g_2 ~ N(. | g_1), ..., as many as a geometric number says. If all are false alarms they
               become a track; if they are one, all of it, they become false alarms. Death is the same draw: ratio 1
-    extend    draws g, g_1, ... likewise. If g is the last of a track and the others are false alarms, they follow it; if
-              they are all that follows it, they become false alarms: ratio 1
+    extend    draws g, g_1, ... likewise. If g ends a track and the others are false alarms, they follow it; if they are
+              all that follows it, they become false alarms: ratio 1
     attach    draws g, then h ~ B(. | g). If g is a false alarm and h of a track without a measurement in g's scan, g
               joins it; if both are of one track, g leaves it. Before and after, h may be any other measurement of the
               track: ratio 1. It extends a track or reduces it by one, and fills or makes a gap

@@ -4,7 +4,8 @@ A window is T scans by time, with G measurements in all, numbered scan after sca
 that one object made, rising, at most one of a scan; what is in no track is a false alarm. With rho(z) the intensity of
 measurements of objects that no scan has shown before, a track from scan f to scan l weighs
 
-    w = rho(z_f) prod_(f < s <= l) a_s q_s * e,   e = sum_(s > l) (1 - a_s) prod_(l < r < s) a_r m_r + prod_(r > l) a_r m_r
+    w = rho(z_f) prod_(f < s <= l) a_s q_s * e
+    e = sum_(s > l) (1 - a_s) prod_(l < r < s) a_r m_r + prod_(r > l) a_r m_r
 
     a_s  probability to have survived since the scan before
     q_s  sum_c w_c p_D N(z_s; h_c, H_c P_c H_c' + R) where the track has a measurement, else m_s
@@ -112,7 +113,7 @@ def window_of(model: HasObjects, scans: Sequence[Any]) -> Window:
             waiting = together(waiting, arrived._replace(existence=expected))
         new = _with_all(model.unseen(scan), waiting)
         view = model.view(scan, no_objects(size), new)
-        mine = Components(new.offset, new.weight.copy(), new.kind, new.mean.copy(), new.covariance.copy())
+        mine = picked(new, np.arange(len(new.weight)), new.offset)
         first.append(see(*mine, np.arange(len(view.values)), *view, np.inf))
         views.append(model.view(scan, no_objects(size), no_components(size)))
         prior.append(new)
@@ -160,14 +161,19 @@ def _missed(model: HasObjects, scan: Any, waiting: Bernoullis) -> Bernoullis:
 def groups(components: Components, keep: Any) -> Components:
     """Some groups of components: keep (T,) says which."""
     size = np.diff(components.offset)
-    rest = (part[np.repeat(keep, size)] for part in components[1:])
-    return Components(np.cumsum([0, *size[keep]]), *rest)
+    return picked(components, np.repeat(keep, size), np.cumsum([0, *size[keep]]))
 
 
 def group(components: Components, t: int) -> Components:
     """Group t alone."""
-    part = slice(components.offset[t], components.offset[t + 1])
-    return Components(np.array([0, part.stop - part.start]), *(values[part] for values in components[1:]))
+    begin, end = components.offset[t], components.offset[t + 1]
+    return picked(components, np.arange(begin, end), np.array([0, end - begin]))
+
+
+def picked(components: Components, rows: Any, offset: Ints) -> Components:
+    """Some components, copied, in groups of their own."""
+    _, weight, kind, mean, covariance = components
+    return Components(offset, weight[rows], kind[rows], mean[rows], covariance[rows])
 
 
 def joined(parts: Sequence[Components]) -> Components:
@@ -209,7 +215,7 @@ def follow(
     for s in range(int(begin.min()), num_scans):
         if len(who):
             objects = Bernoullis(who, np.ones(len(who)), parts)
-            after = moved(model, objects, float(window.seconds[s])) if window.seconds[s] > 0.0 else _copy(objects)
+            after = moved(model, objects, float(window.seconds[s])) if window.seconds[s] > 0.0 else _still(objects)
             parts, stays = after.components, after.existence
             view = model.view(window.scans[s], no_objects(size), parts)
             factor = stays * see(*parts, chosen[who, s], *view, gate)
@@ -219,8 +225,8 @@ def follow(
             gone[who] += np.where(within, 0.0, alive[who] * (1.0 - stays))
             alive[who] *= np.where(within, 1.0, factor)
             for k in np.flatnonzero(within):
-                part = slice(parts.offset[k], parts.offset[k + 1])
-                own = (parts.weight[part], parts.mean[part], parts.covariance[part])
+                at = slice(parts.offset[k], parts.offset[k + 1])
+                own = (parts.weight[at], parts.mean[at], parts.covariance[at])
                 rows[who[k]].append(Row(float(log_sum[who[k]]), *own))
             lost[who, s] = gone[who]
             keep = np.where(within, log_sum[who] > -np.inf, alive[who] > GONE)
@@ -236,13 +242,14 @@ def follow(
     return [_trail(window, *each) for each in zip(tracks, log_sum, end, lost, last, kinds, rows, strict=True)]
 
 
+def _still(objects: Bernoullis) -> Bernoullis:
+    """The same objects, to be written on."""
+    parts = objects.components
+    return objects._replace(components=picked(parts, np.arange(len(parts.weight)), parts.offset))
+
+
 def _state(kind: Ints, row: Row) -> tuple[Floats, Ints, Floats, Floats]:
     return row.weight, kind, row.mean, row.covariance
-
-
-def _copy(objects: Bernoullis) -> Bernoullis:
-    parts = objects.components
-    return objects._replace(components=Components(parts.offset, *(values.copy() for values in parts[1:])))
 
 
 def _trail(

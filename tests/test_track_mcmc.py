@@ -207,7 +207,8 @@ def believed(model: Any, scans: Any) -> dict[int, float]:
 
 
 @pytest.mark.parametrize(
-    ("apart", "detection", "clutter", "bound"), [(30.0, 0.98, 1.0, 0.02), (30.0, 0.7, 20.0, 0.06), (3.0, 0.7, 20.0, 0.1)]
+    ("apart", "detection", "clutter", "bound"),
+    [(30.0, 0.98, 1.0, 0.02), (30.0, 0.7, 20.0, 0.06), (3.0, 0.7, 20.0, 0.1)],
 )
 def test_filter_and_chains_agree_on_two_objects(apart: float, detection: float, clutter: float, bound: float) -> None:
     """Where little is to be mistaken the filter is nearly exact, else wrong by its approximation, up to `bound`."""
@@ -219,9 +220,7 @@ def test_filter_and_chains_agree_on_two_objects(apart: float, detection: float, 
     blank = small_scans((2, 2, 2))
     scans = [b._replace(values=np.array(p) + rng.standard_normal((2, 2))) for b, p in zip(blank, places, strict=True)]
     exact = existence(model, window_of(model, scans))[:, -1]
-    chains = track_mcmc.run(
-        model, scans, seed=3, num_steps=6000, warmup=200, thin=40, gate=1e9, reach=2, report=0.0
-    )
+    chains = track_mcmc.run(model, scans, seed=3, num_steps=6000, warmup=200, thin=40, gate=1e9, reach=2, report=0.0)
     sampled = np.array([chains.existence[(chains.label == g) & (chains.scan == 2)].sum() for g in range(6)])
     num = 8 * 145
     assert (np.abs(sampled - exact) < 5.0 * np.sqrt(exact * (1.0 - exact) / num) + 1e-9).all()
@@ -236,9 +235,7 @@ def test_filter_and_chains_agree_on_two_objects(apart: float, detection: float, 
 
 def test_the_same_seed_gives_the_same_bits() -> None:
     model, scans = small_model(), small_scans((2, 0, 3, 2))
-    first, again, other = (
-        track_mcmc.run(model, scans, seed=seed, num_steps=300, warmup=100) for seed in (1, 1, 2)
-    )
+    first, again, other = (track_mcmc.run(model, scans, seed=seed, num_steps=300, warmup=100) for seed in (1, 1, 2))
     for name in ("label", "existence", "mean", "covariance", "kind"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     np.testing.assert_array_equal(first.draws["count"], again.draws["count"])

@@ -6,8 +6,9 @@ others (inference.track_moves), and is accepted with probability
 
     min(1, prod_added w / prod_removed w * prod_freed lambda_c / prod_taken lambda_c * q' / q)
 
-Chains run side by side, and the tracks that they ask for are filtered side by side, each only from where it differs
-from one that is known already; what a track weighs is kept. So most of a step is to look up.
+What a track weighs is kept, and shared by all chains, so that most steps only look it up. What chains ask for
+together is filtered side by side, each track only from where it differs from one that is known already. A chain needs
+some tens of steps for each measurement.
 
 What comes out is about the window: the posterior given all of its scans, of objects that a scan has shown. An object is
 labelled by its first measurement, as in inference.lmb: a label has, at a scan, the existence
@@ -54,6 +55,7 @@ from models.program import InputError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 ROOM = 2000  # filtered tracks that are kept, to go on from
+LADDER = np.cumsum(SHARES[:-1])
 TRIED, SENSIBLE, ACCEPTED = range(3)
 
 
@@ -106,30 +108,46 @@ class Library:
 
 
 class Chain:
-    """A partition that moves."""
+    """A partition that moves, how many steps it has made, and the step that it has drawn but not made yet."""
 
     def __init__(self, tracks: Sequence[Track], log_density: float, rng: np.random.Generator) -> None:
-        self.owner, self.log_density, self.rng = owner_of(tracks), log_density, rng
+        self.owner, self.log_density, self.rng, self.steps = owner_of(tracks), log_density, rng, 0
+        self.drawn: tuple[int, Edit | None, float] | None = None
+        self.best, self.log_best = tuple(tracks), log_density
 
 
-def step(chains: Sequence[Chain], window: Window, by: Proposals, library: Library, counts: Ints) -> None:
-    """One Metropolis-Hastings step of each chain, in place."""
-    drawn = list[tuple[int, Edit | None, float]]()
-    for chain in chains:
-        move = int(np.searchsorted(np.cumsum(SHARES[:-1]), chain.rng.random(), side="right"))
-        drawn.append((move, propose(chain.owner, window, by, move, chain.rng), chain.rng.random()))
-    library.learn([(track, edit.removed) for _, edit, _ in drawn if edit for track in edit.added])
-    for chain, (move, edit, u) in zip(chains, drawn, strict=True):
-        counts[move, TRIED] += 1
-        if edit is None:
-            continue
-        counts[move, SENSIBLE] += 1
-        change = sum(library.weights[track].log_weight for track in edit.added)
-        change -= sum(library.weights[track].log_weight for track in edit.removed)
-        if math.log(u + 1e-300) < change + edit.log_ratio:
-            counts[move, ACCEPTED] += 1
-            chain.log_density += change
-            apply(chain.owner, edit)
+def step(chain: Chain, window: Window, by: Proposals, library: Library, counts: Ints) -> bool:
+    """One Metropolis-Hastings step, in place; False where the library must first learn the tracks that are drawn."""
+    if chain.drawn is None:
+        move = int(np.searchsorted(LADDER, chain.rng.random(), side="right"))
+        chain.drawn = move, propose(chain.owner, window, by, move, chain.rng), chain.rng.random()
+    move, edit, u = chain.drawn
+    if edit and not all(track in library.weights for track in edit.added):
+        return False
+    chain.drawn, chain.steps = None, chain.steps + 1
+    counts[move, TRIED] += 1
+    if edit is None:
+        return True
+    counts[move, SENSIBLE] += 1
+    change = sum(library.weights[track].log_weight for track in edit.added)
+    change -= sum(library.weights[track].log_weight for track in edit.removed)
+    if math.log(u + 1e-300) < change + edit.log_ratio:
+        counts[move, ACCEPTED] += 1
+        chain.log_density += change
+        apply(chain.owner, edit)
+        if chain.log_density > chain.log_best + 1e-9:
+            chain.best, chain.log_best = tracks_of(chain.owner), chain.log_density
+    return True
+
+
+def advance(chains: Sequence[Chain], window: Window, by: Proposals, library: Library, counts: Ints, until: int) -> None:
+    """Run all chains on to so many steps, each as far as it can before what they ask for is learnt at once."""
+    while behind := [chain for chain in chains if chain.steps < until]:
+        for chain in behind:
+            while chain.steps < until and step(chain, window, by, library, counts):
+                pass
+        drawn = [chain.drawn[1] for chain in behind if chain.drawn]
+        library.learn([(track, edit.removed) for edit in drawn if edit for track in edit.added])
 
 
 @answers_first
@@ -140,9 +158,9 @@ def run(
     seed: int,
     start: Literal["lmb", "nothing"] = "lmb",
     num_chains: int = 8,
-    num_steps: int = 2000,
-    warmup: int = 500,
-    thin: int = 5,
+    num_steps: int = 3000,
+    warmup: int = 1000,
+    thin: int = 10,
     gate: float = 36.0,
     reach: int = 5,
     report: float = 0.01,
@@ -150,7 +168,8 @@ def run(
 ) -> Tracks:
     """Sample partitions of the measurements of all scans, in the order of time.
 
-    start   of all chains: the tracks of the labeled multi-Bernoulli filter, or false alarms only
+    start   of all chains: the tracks of the labeled multi-Bernoulli filter; or false alarms only, from where long
+            tracks are found slowly
     thin    every so many steps after the warm-up a partition is kept
     gate    squared Mahalanobis distance beyond which a measurement is not of a track
     reach   scans within which moves look for the next measurement of a track, as a rule
@@ -176,31 +195,27 @@ def run(
     log_density = sum(library.weights[track].log_weight for track in tracks)
     seeds = np.random.SeedSequence(seed).spawn(num_chains + 1)
     chains = [Chain(tracks, log_density, np.random.default_rng(each)) for each in seeds[:-1]]
-    counts, best, log_best = np.zeros((len(NAMES), 3), dtype=np.int64), tuple(tracks), log_density
+    counts, due = np.zeros((len(NAMES), 3), dtype=np.int64), range(warmup + thin, num_steps + 1, thin)
     kept: list[list[tuple[Track, ...]]] = [[] for _ in chains]
-    with Progress("data association", num_steps, progress) as bar:
-        for i in range(num_steps if len(window.scan) else 0):
-            step(chains, window, by, library, counts)
-            top = max(chains, key=lambda chain: chain.log_density)
-            if top.log_density > log_best + 1e-9:
-                best, log_best = tracks_of(top.owner), top.log_density
-            if i >= warmup and (i - warmup) % thin == thin - 1:
-                for own, chain in zip(kept, chains, strict=True):
-                    own.append(tracks_of(chain.owner))
+    with Progress("data association", len(due), progress) as bar:
+        for until in due:
+            if len(window.scan):
+                advance(chains, window, by, library, counts, until)
+            for own, chain in zip(kept, chains, strict=True):
+                own.append(tracks_of(chain.owner))
             bar.advance(1)
-    if not len(window.scan):
-        kept = [[()] * ((num_steps - warmup) // thin) for _ in chains]
+    top = max(chains, key=lambda chain: chain.log_best)
     info = {
         "engine": "track_mcmc",
         "seconds": time.perf_counter() - began,
         "evaluations": library.filtered,
         "acceptance": {name: float(c[ACCEPTED] / max(c[TRIED], 1)) for name, c in zip(NAMES, counts, strict=True)},
         "sensible": {name: float(c[SENSIBLE] / max(c[TRIED], 1)) for name, c in zip(NAMES, counts, strict=True)},
-        "log_joint": log_best,
+        "log_joint": top.log_best,
         "scans": len(window.scans),
         "flags": list[str](),
     }
-    return _tracks(model, window, library, kept, best, report, info, np.random.default_rng(seeds[-1]))
+    return _tracks(model, window, library, kept, top.best, report, info, np.random.default_rng(seeds[-1]))
 
 
 def _start(model: HasObjects, window: Window, library: Library) -> list[Track]:

@@ -98,7 +98,7 @@ def pairs_of(model: HasObjects, belief: Belief, scan: Any, number: int, gate: fl
         predicted=view.predicted[:count], slope=view.slope[:count], detection=view.detection[:count]
     )  # of objects, not of what may be new
     table = weights_of(parts.offset, parts.weight, parts.kind, parts.covariance, *here, gate)
-    seen = np.bincount(parts.group, parts.weight * here.detection, len(objects.label))
+    seen = np.bincount(parts.group, parts.weight * here.detection, len(objects.label)).astype(np.float64)
     return Pairs(objects.label, objects.existence, seen, table / np.maximum(view.clutter + rho, 1e-100))
 
 

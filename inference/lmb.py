@@ -84,19 +84,23 @@ class Belief(NamedTuple):
     measurement: Ints = np.zeros(0, dtype=np.int64)
 
 
+def moved(model: HasObjects, objects: Bernoullis, seconds: float) -> Bernoullis:
+    """What time makes of objects: where they are `seconds` later, and whether they still are."""
+    if not len(objects.label):
+        return objects
+    steps = max(1, math.ceil(seconds / LONGEST - 1e-9))
+    offset, weight, kind, mean, covariance = objects.components
+    existence, weight, covariance = objects.existence.copy(), weight.copy(), covariance.copy()
+    for _ in range(steps):
+        found = model.move(kind, mean, seconds / steps)
+        propagate(offset, existence, weight, covariance, found.slope, found.noise, found.survival)
+        mean = found.mean
+    return Bernoullis(objects.label, existence, Components(offset, weight, kind, mean, covariance))
+
+
 def predict(model: HasObjects, belief: Belief, seconds: float, number: int) -> Bernoullis:
     """The objects `seconds` later, with those that arrived at known places, labelled by the scan's `number`."""
-    objects = belief.objects
-    steps = max(1, math.ceil(seconds / LONGEST - 1e-9))
-    if len(objects.label):
-        offset, weight, kind, mean, covariance = objects.components
-        existence, weight, covariance = objects.existence.copy(), weight.copy(), covariance.copy()
-        for _ in range(steps):
-            moved = model.move(kind, mean, seconds / steps)
-            propagate(offset, existence, weight, covariance, moved.slope, moved.noise, moved.survival)
-            mean = moved.mean
-        objects = Bernoullis(objects.label, existence, Components(offset, weight, kind, mean, covariance))
-    arrived = model.arrivals(seconds)
+    objects, arrived = moved(model, belief.objects, seconds), model.arrivals(seconds)
     if len(arrived.label):
         label = number * STRIDE + STRIDE // 2 + np.arange(len(arrived.label))
         objects = together(objects, arrived._replace(label=label))

@@ -72,11 +72,11 @@ def track(
 ) -> Tracks:
     """What `tell` says of the belief after each arrival. Raises InputError for no scans, and for one that the model
     cannot use."""
-    if not len(scans):
-        raise InputError("a filter needs at least one scan, but got none; wait for the first")
     if not patience >= 0.0:
         raise InputError(f"patience is {patience}; give the seconds that a scan may come late, 0 or more")
     scans = model.check(scans)
+    if not len(scans):
+        raise InputError("a filter needs at least one scan, but got none; wait for the first")
     accept()
     past, told, seconds, now = list[Past](), list[Objects](), list[float](), list[float]()
     total, late, too_late = np.zeros(3), 0, 0  # facts of the steps that the belief is made of

@@ -723,3 +723,11 @@ def test_objects_are_told_of_by_their_heaviest_component() -> None:
     assert m.tolist() == [[1.0], [2.0]]
     assert V.tolist() == [[[1.0]], [[2.0]]]
     np.testing.assert_allclose(p, [[0.4, 0.6, 0.0], [0.5, 0.0, 0.5]], atol=1e-15)
+
+
+def test_recordings_are_as_good_as_their_scans() -> None:
+    scans = tuple(plots(0.1 * k, [(3.0, 0.5 * k)]) for k in range(4))
+    one, other = lmb.run(STRAIGHT, scans), lmb.run(STRAIGHT, Recording(scans))
+    np.testing.assert_array_equal(one.existence, other.existence)
+    with pytest.raises(InputError, match="at least one scan"):
+        lmb.run(STRAIGHT, Recording(()))

@@ -97,7 +97,7 @@ class Traffic:
     sensors: tuple[Sensor, ...]
     motion: Motion = field(default_factory=ConstantTurn)
     kinds: tuple[Kind, ...] = (Kind(),)
-    unseen_density: float = 1e-4  # [1/m^2]
+    unseen_density: float = 1e-4  # [1/m^2]: of ground that stays in view, what arrives between two scans
     places: tuple[Place, ...] = ()
     ground: Ground | None = None  # where it is known, instead of unseen_density
     region: tuple[float, float, float, float] = (-100.0, -100.0, 100.0, 100.0)  # x, y to x, y [m]: of the program
@@ -239,11 +239,11 @@ class Traffic:
         """The frames of a recording, in its order. Raises InputError for a scan that cannot be used (`check`)."""
         return frames_of(self, self.check(recording.scans))
 
-    def check(self, scans: Sequence[Scan | ScanFrame]) -> tuple[Scan, ...]:
-        """The scans in the order given, those of frames for frames. Raises InputError for a sensor that the model has
+    def check(self, scans: Recording | Sequence[Scan | ScanFrame]) -> tuple[Scan, ...]:
+        """The scans in the order given, those of a recording, those of frames for frames. Raises InputError for a sensor that the model has
         not, and for numbers that no sensor gives (models.objects.scans)."""
         found = list[Scan]()
-        for scan in scans:
+        for scan in scans.scans if isinstance(scans, Recording) else scans:
             scan = scan.scan if isinstance(scan, ScanFrame) else scan
             sensor = self.sensor(scan)
             found.append(check_scan(scan, sensor.names, len(self.kinds)))

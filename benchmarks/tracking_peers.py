@@ -20,7 +20,7 @@ SETTINGS: dict[tuple[str, int], dict[str, Any]] = {
     ("gnn", 30): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
     ("jpda", 30): {"hits": 4, "gate": 3.5, "misses": 2, "held": 1},
     ("phd", 30): {"merge": 16.0, "gate": 5.0, "prune": 1e-4},
-    ("gnn", 66): {"hits": 5, "gate": 4.0, "misses": 2, "held": 1},
+    ("gnn", 66): {"hits": 5, "gate": 4.0, "misses": 2, "held": 1},  # as jpda's, not searched for itself
     ("jpda", 66): {"hits": 5, "gate": 4.0, "misses": 2, "held": 1},
 }
 NAMES = {"gnn": "GNN", "jpda": "JPDA-EHM2", "phd": "GM-PHD"}

@@ -233,7 +233,7 @@ def _tracks(model: Traffic, scans: Sequence[Scan], step: Step, progress: bool, t
             existence = np.array([r for _, r, _ in found], dtype=float)
             told.append(Objects(np.array(label, dtype=np.int64), existence, mean, spread, np.ones((len(found), 1))))
             bar.advance(1)
-    rows = [np.concatenate(columns) for columns in zip(*told, strict=True)]
+    rows = [np.concatenate(columns) for columns in zip(*(objects[:5] for objects in told), strict=True)]
     return Tracks(
         time=np.array([scan.time for scan in scans]),
         offset=np.cumsum([0, *(len(objects.label) for objects in told)]),

@@ -5,7 +5,6 @@ tracks outside are no part of either."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,5 +55,4 @@ def in_view(tracks: Tracks, recording: Recording, traffic: Traffic) -> Tracks:
         for sensor in traffic.sensors:
             if sensor.name in used:
                 keep[rows] |= sensor.view(body, tuple(mounted(pose, sensor.mount)), sensor.settings[3:], np) > 0.5
-    rows_kept = {name: getattr(tracks, name)[keep] for name in ("label", "existence", "mean", "covariance", "kind")}
-    return replace(tracks, draws={}, offset=np.concatenate([[0], np.cumsum(keep)])[tracks.offset], **rows_kept)
+    return tracks.kept(keep)

@@ -120,7 +120,10 @@ class Tracks(Posterior):
 
     def confirmed(self, threshold: float = 0.5) -> Tracks:
         """The rows whose existence is above the threshold."""
-        keep = self.existence > threshold
+        return self.kept(self.existence > threshold)
+
+    def kept(self, keep: NDArray[np.bool_]) -> Tracks:
+        """The rows that are to be kept (R,)."""
         return replace(
             self,
             draws={},

@@ -240,7 +240,7 @@ class Traffic:
         return frames_of(self, self.check(recording.scans))
 
     def check(self, scans: Recording | Sequence[Scan | ScanFrame]) -> tuple[Scan, ...]:
-        """The scans in the order given, those of a recording, those of frames for frames. Raises InputError for a sensor that the model has
+        """The scans in the order given, those of frames for frames. Raises InputError for a sensor that the model has
         not, and for numbers that no sensor gives (models.objects.scans)."""
         found = list[Scan]()
         for scan in scans.scans if isinstance(scans, Recording) else scans:

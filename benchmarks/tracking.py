@@ -19,7 +19,7 @@ from benchmarks import figure as fig
 if TYPE_CHECKING:
     from benchmarks.tracking_trials import Effort
 
-PARTS = ("tracking_speed", "tracking_peers", "tracking_accuracy", "kitti_baseline")
+PARTS = ("tracking_speed", "tracking_peers", "tracking_accuracy", "kitti_tracking", "kitti_baseline")
 
 
 def measurements() -> tuple[fig.Measurement, ...]:

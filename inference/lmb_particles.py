@@ -65,7 +65,8 @@ class Knobs(NamedTuple):
 class Belief(NamedTuple):
     """T objects of N particles each at a time [s], None before the first scan.
 
-    label (T,), existence (T,), weight (T, N) summing to one by object, kind (T, N), state (T, N, n)
+    label (T,), existence (T,), weight (T, N) summing to one by object, kind (T, N), state (T, N, n), and family (T, N):
+    in which component of the newcomers a particle began
     """
 
     time: float | None
@@ -74,6 +75,7 @@ class Belief(NamedTuple):
     weight: Floats
     kind: Ints
     state: Floats
+    family: Ints
 
     @property
     def offset(self) -> Ints:
@@ -95,8 +97,8 @@ class Belief(NamedTuple):
 def nobody(size: int, num_particles: int) -> Belief:
     """No objects, at no time."""
     none = np.zeros((0, num_particles))
-    label = np.zeros(0, dtype=np.int64)
-    return Belief(None, label, np.zeros(0), none, none.astype(np.int64), np.zeros((0, num_particles, size)))
+    label, index = np.zeros(0, dtype=np.int64), none.astype(np.int64)
+    return Belief(None, label, np.zeros(0), none, index, np.zeros((0, num_particles, size)), index)
 
 
 def together(a: Belief, b: Belief) -> Belief:
@@ -126,8 +128,9 @@ def predict(model: HasObjects, belief: Belief, seconds: float, number: int, rng:
     normal = rng.standard_normal((len(component), size))
     state = draw(component, missed, parts.mean, parts.covariance, *NOTHING, np.zeros(0), normal)
     even = np.full((len(label), num), 1.0 / num)
-    kind, state = parts.kind[component].reshape(-1, num), state.reshape(-1, num, size)
-    return together(belief, Belief(belief.time, label, arrived.existence, even, kind, state))
+    kind, state, component = (part.reshape(-1, num, *part.shape[1:]) for part in (parts.kind[component], state, component))
+    family = component - parts.offset[:-1, None]
+    return together(belief, Belief(belief.time, label, arrived.existence, even, kind, state, family))
 
 
 def components_of(offset: Ints, weight: Floats, groups: Any, num: int, rng: np.random.Generator) -> Ints:
@@ -140,22 +143,23 @@ def components_of(offset: Ints, weight: Floats, groups: Any, num: int, rng: np.r
     return np.concatenate(parts)
 
 
-def refresh(belief: Belief, period: Floats, num_kinds: int, knobs: Knobs, rng: np.random.Generator) -> Belief:
-    """Resample the objects whose particles are worth too few, and spread the copies about the means of their kinds."""
+def refresh(belief: Belief, period: Floats, knobs: Knobs, rng: np.random.Generator) -> Belief:
+    """Resample the objects whose particles are worth too few, and spread the copies, each family about its own mean."""
     num, size = belief.state.shape[1:]
     rows = np.flatnonzero(np.square(belief.weight).sum(1) * knobs.ess * num > 1.0)
     if not len(rows):
         return belief
-    poor = belief.only(rows)
-    first = num_kinds * np.arange(len(rows))[:, None]
-    group, num_groups = (first + poor.kind).ravel(), num_kinds * len(rows)
-    mean, covariance = moments(group, num_groups, poor.weight.ravel(), poor.state.reshape(-1, size), period)
-    index = components_of(poor.offset, poor.weight.ravel(), range(len(rows)), num, rng)
-    kind, state = poor.kind.ravel()[index], poor.state.reshape(-1, size)[index]
+    poor, num_families = belief.only(rows), int(belief.family.max()) + 1
+    weight, state = poor.weight.ravel(), poor.state.reshape(-1, size)
+    group = (num_families * np.arange(len(rows))[:, None] + poor.family).ravel()
+    mean, covariance = moments(group, num_families * len(rows), weight, state, period)
+    index = components_of(poor.offset, weight, range(len(rows)), num, rng)
+    state = state[index]
     spread(group[index], mean, covariance, state, period, knobs.kernel, rng.standard_normal(state.shape))
-    whole = belief._replace(weight=belief.weight.copy(), kind=belief.kind.copy(), state=belief.state.copy())
-    whole.weight[rows], whole.kind[rows] = 1.0 / num, kind.reshape(-1, num)
-    whole.state[rows] = state.reshape(-1, num, size)
+    whole = Belief(belief.time, *(value.copy() for value in belief[1:]))
+    whole.weight[rows], whole.state[rows] = 1.0 / num, state.reshape(-1, num, size)
+    whole.kind[rows] = poor.kind.ravel()[index].reshape(-1, num)
+    whole.family[rows] = poor.family.ravel()[index].reshape(-1, num)
     return whole
 
 
@@ -169,8 +173,8 @@ def begin(
     born: Ints,
     num: int,
     rng: np.random.Generator,
-) -> tuple[Floats, Ints, Floats]:
-    """Weights and kinds (B, N) and states (B, N, n) of what measurements born (B,) show first, by the masses of the
+) -> tuple[Floats, Ints, Floats, Ints]:
+    """Weights and kinds (B, N), states (B, N, n) and families (B, N) of what measurements born (B,) show first, by the masses of the
     components of unseen objects. `view` is of the particles of the objects and of these components."""
     size, first = unseen.mean.shape[1], len(objects.components.weight)
     component = components_of(unseen.offset, mass, born, num, rng)
@@ -185,7 +189,8 @@ def begin(
         state, seen, detected, component, measurement, unseen.mean, predicted, slope, detection, *rest
     ).reshape(-1, num)
     weight = np.exp(log_weight - log_weight.max(1, keepdims=True))
-    return weight / weight.sum(1, keepdims=True), kind.reshape(-1, num), state.reshape(-1, num, size)
+    family = component.reshape(-1, num) - unseen.offset[born, None]
+    return weight / weight.sum(1, keepdims=True), kind.reshape(-1, num), state.reshape(-1, num, size), family
 
 
 def look(model: HasObjects, scan: Timed, objects: Bernoullis, kind: Ints, state: Floats) -> tuple[Floats, Floats]:
@@ -206,7 +211,7 @@ def step(
     must not be older than the belief."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
     seconds = 0.0 if belief.time is None else scan.time - belief.time
-    belief = refresh(belief, model.period, len(model.kind_names), knobs, rng)._replace(time=scan.time)
+    belief = refresh(belief, model.period, knobs, rng)._replace(time=scan.time)
     if seconds > 0.0:
         belief = predict(model, belief, seconds, number, rng)
     objects, unseen = belief.as_components(), model.unseen(scan)

@@ -8,7 +8,17 @@ import numpy as np
 from numba import njit
 
 from inference.association_kernel import AUTO, associate
-from inference.lmb_kernel import LOG_TAU, MAX_ITERATIONS, TOLERANCE, cholesky, longer, unseen_mass, whiten, wrapped
+from inference.lmb_kernel import (
+    LOG_TAU,
+    MAX_ITERATIONS,
+    TOLERANCE,
+    cholesky,
+    longer,
+    project,
+    unseen_mass,
+    whiten,
+    wrapped,
+)
 from inference.object_particles import LEAST_MISS
 
 
@@ -28,77 +38,94 @@ def seen_moments(w, seen, period, mean, S):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def update(  # type: ignore[no-untyped-def]
-    existence, weight, kind,
+    existence, weight, kind, P, uniform,
     new_offset, new_weight, new_kind, new_mean, new_P,
     predicted, slope, detection, values, noise, sort, clutter, feature, period,
     gate, max_shared,
 ):  # fmt: skip
-    """Existence (T,) and weights (T, N) of the particles given a scan, in place, and what it shows first: existence
+    """Existence (T,) given a scan, in place; which components (T, N) and which measurements of theirs (T, N), -1 for
+    missed, posterior particles are to be drawn from, by uniform numbers (T,); and what the scan shows first: existence
     (M,), the masses of the components of unseen objects (U,), (log partition, groups by belief propagation).
 
-    Equations in inference.lmb_particles. Of particle i of object t, h is predicted[t N + i]; those of unseen objects
-    follow."""
+    Equations in inference.lmb_particles. Component i of object t is number t N + i, with covariance P (T N, n, n); those
+    of unseen objects follow."""
     num, count = weight.shape
-    M, d = len(values), len(period)
+    M, d, n = len(values), len(period), new_mean.shape[1]
     mass, rho = unseen_mass(
         new_offset, new_weight, new_kind, new_P, num * count,
         predicted, slope, detection, values, noise, sort, feature, period,
     )  # fmt: skip
     intensity = np.maximum(clutter + rho, 1e-100)  # of measurements that no old object made
-    root, log_norm = np.empty(noise.shape), np.empty(len(noise))
-    for k in range(len(noise)):
-        log_norm[k] = -cholesky(noise[k], root[k]) - 0.5 * d * LOG_TAU
-    mean, S, residual, y = np.empty(d), np.empty(d), np.empty(d), np.empty(d)
+    G, base, C, residual, y = np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d), np.empty(d)
+    mean, variance = np.empty(d), np.empty(d)
     table_offset, missed, entries = np.zeros(num + 1, np.int64), np.empty(num), 0
     room = 2 * num + 16
     measurement, ratio, made = np.empty(room, np.int64), np.empty(room), np.empty((room, count))
     for t in range(num):
-        seen, here = 0.0, predicted[t * count : (t + 1) * count]
+        seen, first, best = 0.0, t * count, t * count + weight[t].argmax()
         for i in range(count):
-            seen += weight[t, i] * detection[t * count + i]
+            seen += weight[t, i] * detection[first + i]
         missed[t] = max(1.0 - existence[t] * seen, LEAST_MISS)
+        start = entries
         if seen > 1e-9:
-            seen_moments(weight[t], here, period, mean, S)
+            seen_moments(weight[t], predicted[first : first + count], period, mean, variance)
+            project(P[best], slope[best], G, base)
             for j in range(M):
-                near, R = True, sort[j]
+                near = True
                 for a in range(d):
                     off = wrapped(values[j, a] - mean[a], period[a])
-                    near = near and off * off <= gate * (S[a] + noise[R, a, a])
-                if not near:
-                    continue
-                if entries == len(ratio):
-                    measurement, ratio, made = longer(measurement), longer(ratio), longer(made)
-                total = 0.0
-                for i in range(count):
-                    for a in range(d):
-                        residual[a] = wrapped(values[j, a] - here[i, a], period[a])
-                    square = whiten(root[R], residual, y)
-                    likelihood = detection[t * count + i] * feature[j, kind[t, i]] * math.exp(log_norm[R] - 0.5 * square)
-                    made[entries, i] = existence[t] * weight[t, i] * likelihood / intensity[j]
-                    total += made[entries, i]
-                if total > 0.0:
-                    measurement[entries], ratio[entries] = j, total
+                    near = near and off * off <= gate * (variance[a] + base[a, a] + noise[sort[j], a, a])
+                if near:
+                    if entries == len(ratio):
+                        measurement, ratio, made = longer(measurement), longer(ratio), longer(made)
+                    measurement[entries], ratio[entries] = j, 0.0
                     entries += 1
         table_offset[t + 1] = entries
+        if entries == start:
+            continue
+        for i in range(count):
+            project(P[first + i], slope[first + i], G, base)
+            solved, log_norm = -1, 0.0
+            for e in range(start, entries):
+                j = measurement[e]
+                if solved != sort[j]:
+                    solved = sort[j]
+                    log_norm = -cholesky(base + noise[solved], C) - 0.5 * d * LOG_TAU
+                for a in range(d):
+                    residual[a] = wrapped(values[j, a] - predicted[first + i, a], period[a])
+                likelihood = feature[j, kind[t, i]] * math.exp(log_norm - 0.5 * whiten(C, residual, y))
+                made[e, i] = existence[t] * weight[t, i] * detection[first + i] * likelihood / intensity[j]
+                ratio[e] += made[e, i]
     taken, free = np.empty(entries), np.empty(num)
     log_partition, loopy, _ = associate(
         table_offset, measurement[:entries], ratio[:entries], missed, M,
         AUTO, max_shared, TOLERANCE, MAX_ITERATIONS, 0, np.zeros(1, np.uint64), taken, free,
     )  # fmt: skip
-    first = rho / intensity
-    explained = np.zeros(M)
+    component, chosen = np.empty((num, count), np.int64), np.empty((num, count), np.int64)
+    explained, share = np.zeros(M), np.empty(count)
     for t in range(num):
-        for i in range(count):
-            weight[t, i] *= free[t] * existence[t] * (1.0 - detection[t * count + i]) / missed[t]
-        for e in range(table_offset[t], table_offset[t + 1]):
-            explained[measurement[e]] += taken[e]
-            for i in range(count):
-                weight[t, i] += taken[e] * made[e, i] / ratio[e]
         total = 0.0
         for i in range(count):
-            total += weight[t, i]
+            share[i] = free[t] * existence[t] * weight[t, i] * (1.0 - detection[t * count + i]) / missed[t]
+            total += share[i]
+        for e in range(table_offset[t], table_offset[t + 1]):
+            explained[measurement[e]] += taken[e]
+            total += taken[e]
+        made_so_far, reached, mark = 0, 0.0, uniform[t] * total / count
+        for e in range(table_offset[t] - 1, table_offset[t + 1]):
+            j = -1
+            if e >= table_offset[t]:
+                j = measurement[e]
+                for i in range(count):
+                    share[i] = taken[e] * made[e, i] / ratio[e] if ratio[e] > 0.0 else 0.0
+            for i in range(count):
+                reached += share[i]
+                while made_so_far < count and mark < reached:
+                    component[t, made_so_far], chosen[t, made_so_far] = t * count + i, j
+                    made_so_far += 1
+                    mark += total / count
+        for k in range(made_so_far, count):  # rounding
+            component[t, k], chosen[t, k] = (component[t, k - 1], chosen[t, k - 1]) if k else (t * count, -1)
         existence[t] = min(total, 1.0)
-        for i in range(count):
-            weight[t, i] = weight[t, i] / total if total > 0.0 else 1.0 / count
-    first *= np.maximum(1.0 - explained, 0.0)
-    return first, mass, (log_partition + np.log(intensity).sum(), loopy)
+    first_existence = np.maximum(1.0 - explained, 0.0) * rho / intensity
+    return component, chosen, first_existence, mass, (log_partition + np.log(intensity).sum(), loopy)

@@ -12,10 +12,9 @@ the weight of a draw needs no density of states, only the ratio of the likelihoo
 and that of one that was missed, drawn from N(m, P), is (1 - p_D(x)) / (1 - p_D(m)). For linear h and constant p_D all
 weights are one.
 
-Regularised resampling (Musso, Oudjane and Le Gland 2001) with the shrinkage of Liu and West (2001): copies of particles
-are spread by a kernel of h^2 times the covariance V of their cloud, and drawn to its mean so that V stays what it is,
-
-    x <- m + sqrt(1 - h^2) (x - m) + h N(0, V)
+Particles are regularised (Musso, Oudjane and Le Gland 2001) with the shrinkage of Liu and West (2001): they are taken
+for the middles of kernels of h^2 times the covariance V of their cloud, and drawn to its mean m, so that V stays what
+it is,   x ~ N(m + sqrt(1 - h^2) (x_i - m), h^2 V).
 """
 
 from __future__ import annotations
@@ -77,6 +76,18 @@ def draw(component, measurement, mean, P, predicted, slope, values, noise, sort,
             for k in range(i + 1):
                 total += root[i, k] * normal[p, k]
             found[p, i] = total
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def draw_prior(component, mean, P, normal):  # type: ignore[no-untyped-def]
+    """States (D, n) of components (D,) that nothing is known of but N(mean[c], P[c]), of normal numbers (D, n)."""
+    num, n = normal.shape
+    root, found = np.empty((n, n)), np.empty((num, n))
+    for p in range(num):
+        if p == 0 or component[p] != component[p - 1]:
+            root_of(P[component[p]], root)
+        found[p] = mean[component[p]] + root @ normal[p]
     return found
 
 
@@ -149,17 +160,13 @@ def moments(group, num, weight, state, period):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def spread(group, mean, P, state, period, kernel, normal):  # type: ignore[no-untyped-def]
-    """Draw states (D, n) to the mean of their clouds, group (D,) of mean (G, n) and covariance P (G, n, n), and spread
-    them, in place; kernel is h."""
+def widen(group, mean, V, period, kernel, state, P):  # type: ignore[no-untyped-def]
+    """Make particles (D, n) of clouds group (D,), of mean (G, n) and covariance V (G, n, n), the middles of components
+    that have the cloud's moments, in place: x <- m + sqrt(1 - h^2) (x - m),   P <- P + h^2 V,   h = kernel."""
     n, keep = state.shape[1], math.sqrt(1.0 - kernel * kernel)
-    root = np.empty((len(mean), n, n))
-    for g in range(len(mean)):
-        root_of(P[g], root[g])
     for p in range(len(group)):
         g = group[p]
         for a in range(n):
-            total = mean[g, a] + keep * wrapped(state[p, a] - mean[g, a], period[a])
-            for k in range(a + 1):
-                total += kernel * root[g, a, k] * normal[p, k]
-            state[p, a] = total
+            state[p, a] = mean[g, a] + keep * wrapped(state[p, a] - mean[g, a], period[a])
+            for b in range(n):
+                P[p, a, b] += kernel * kernel * V[g, a, b]

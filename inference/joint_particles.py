@@ -1,12 +1,12 @@
 """Joint particle filter of few objects: each of N particles is a whole scene, who is there, of which kind and where.
 
-It says what filters of independent objects leave out, such as that either of two is there, but not both. It lives on
-inference.lmb's model (HasObjects): a measurement may be of an object of the particle, a false alarm (lambda_c), or of an
+It says what filters of independent objects leave out, such as that either of two is there, but not both. Its model
+is inference.lmb's (HasObjects): a measurement may be of an object of the particle, a false alarm (lambda_c), or of an
 object that no scan has shown yet (rho). One scan, with particles n of weights W, is an auxiliary particle filter
 (Pitt and Shephard 1999) whose look ahead is exact where h is linear and p_D does not depend on the state:
 
     weigh      with components of the objects as in inference.lmb_particles, and s survival,
-                   p(Z | n) = sum_theta prod_missed (1 - s p_D) prod_detected s eta(z_theta) / kappa_theta  prod_j kappa_j
+                   p(Z | n) = prod_j kappa_j sum_theta prod_missed (1 - s p_D) prod_detected s eta(z_theta) / kappa_theta
                over all associations theta, exactly; kappa = lambda_c + rho.   p(Z | past) ~ sum W p(Z | n)
     resample   systematically, where 1 / sum W^2 < ess N with W <- W p(Z | n) / sum
     draw       theta from its exact posterior; of what it leaves over, measurement j begins an object with probability

@@ -4,16 +4,16 @@ What is believed is what inference.lmb believes, with the density of each object
 kinds and states instead of few Gaussians: it may have any shape. Particles by themselves die out where an accurate
 sensor hits between them. So they are regularised, and led to where the scan is (inference.object_particles):
 
-predict   r <- r sum w_i s(x_i),   w_i <- w_i s(x_i) / sum.   Component i is N(m_i, P_i), the kernel about f(x_i) and the
-          noise of the motion, P_i = L L' + h^2 V with V the covariance of its family: particles that began alike
+predict   r <- r sum w_i s(x_i),   w_i <- w_i s(x_i) / sum.   Component i is N(m_i, P_i), the kernel about f(x_i) and
+          the noise of the motion, P_i = L L' + h^2 V with V the covariance of its family: particles that began alike
 update    eta_ij = p_D(m_i) N(z_j; h(m_i), H P_i H' + R) l(z_j | k_i), with the slope H at m_i. The associations have
           weights prod_missed (1 - r sum_i w_i p_D(m_i)) prod_detected r sum_i w_i eta_ij / kappa_j and marginals beta:
               r <- beta_t0 r (1 - sum_i w_i p_D(m_i)) / (1 - r sum_i w_i p_D(m_i)) + sum_j beta_tj
           N pairs (i, j) of a component and its measurement, or none, are drawn by systematic resampling with weights
           beta_t0 w_i (1 - p_D(m_i)) r / (1 - r sum_i w_i p_D(m_i)) and beta_tj w_i eta_ij / sum_i w_i eta_ij, then
           x ~ p(x | i, z_j) of the linearised h, and w what the linearisation got wrong: an auxiliary particle filter
-birth     z_j begins an object with r = (1 - sum_t beta_tj) rho_j / kappa_j; rho_j is that of inference.lmb, h linearised
-          at the components of unseen objects, and the particles are drawn from these and weighted in the same way.
+birth     z_j begins an object with r = (1 - sum_t beta_tj) rho_j / kappa_j; rho_j is that of inference.lmb, with h
+          linearised at the components of unseen objects; particles are drawn from these and weighted in the same way.
 
 Each scan has random numbers of its own, from the seed and its number: a step is a function of belief and scan.
 """
@@ -53,8 +53,8 @@ class Knobs(NamedTuple):
     max_shared     measurements that objects of a group may share for exact association; belief propagation beyond
     """
 
-    num_particles: int = 500
-    kernel: float = 0.3
+    num_particles: int = 1000
+    kernel: float = 0.4
     gate: float = 25.0
     faint: float = 1e-4
     max_shared: int = 8
@@ -136,8 +136,8 @@ def predict(
 def moved_on(
     model: HasObjects, kind: Ints, state: Floats, seconds: float, rng: np.random.Generator
 ) -> tuple[Floats, Floats, Floats]:
-    """States (R, n) `seconds` later but for the noise of the last step, of covariance (R, n, n); survival (R,). The noise
-    of steps before it is drawn."""
+    """States (R, n) `seconds` later but for the noise of the last step, of covariance (R, n, n); survival (R,). The
+    noise of the steps before it is drawn."""
     num, size = state.shape
     survival, covariance = np.ones(num), np.zeros((num, size, size))
     if seconds == 0.0 or not num:
@@ -152,7 +152,7 @@ def moved_on(
 
 
 def components_of(offset: Ints, weight: Floats, groups: Any, num: int, rng: np.random.Generator) -> Ints:
-    """Components for `num` particles of each of some groups, one group after the other, as often as their weight says."""
+    """Components for `num` particles of each of some groups, one after the other, as often as their weight says."""
     with np.errstate(divide="ignore"):
         log_weight = np.log(weight)
     parts = [offset[g] + weights.systematic(log_weight[offset[g] : offset[g + 1]], num, rng.random()) for g in groups]

@@ -47,8 +47,8 @@ def update(  # type: ignore[no-untyped-def]
     missed, posterior particles are to be drawn from, by uniform numbers (T,); and what the scan shows first: existence
     (M,), the masses of the components of unseen objects (U,), (log partition, groups by belief propagation).
 
-    Equations in inference.lmb_particles. Component i of object t is number t N + i, with covariance P (T N, n, n); those
-    of unseen objects follow."""
+    Equations in inference.lmb_particles. Component i of object t is number t N + i, with covariance P (T N, n, n);
+    those of unseen objects follow."""
     num, count = weight.shape
     M, d, n = len(values), len(period), new_mean.shape[1]
     mass, rho = unseen_mass(

@@ -6,7 +6,7 @@ object that no scan has shown yet (rho). One scan, with particles n of weights W
 (Pitt and Shephard 1999) whose look ahead is exact where h is linear and p_D does not depend on the state:
 
     weigh      with components of the objects as in inference.lmb_particles, and s survival,
-                   p(Z | n) = prod_j kappa_j sum_theta prod_missed (1 - s p_D) prod_detected s eta(z_theta) / kappa_theta
+               p(Z | n) = prod_j kappa_j sum_theta prod_missed (1 - s p_D) prod_detected s eta(z_theta) / kappa_theta
                over all associations theta, exactly; kappa = lambda_c + rho.   p(Z | past) ~ sum W p(Z | n)
     resample   systematically, where 1 / sum W^2 < ess N with W <- W p(Z | n) / sum
     draw       theta from its exact posterior; of what it leaves over, measurement j begins an object with probability
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from inference import weights
 from inference.joint_particles_kernel import associations, weigh
 from inference.lmb import STRIDE
-from inference.lmb_particles import check_particles, components_of, meet, moved_on
+from inference.lmb_particles import check_particles, components_of, meet, moved_on, side_by_side
 from inference.object_particles import LEAST_MISS, draw_prior, moments, widen
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
@@ -119,11 +119,12 @@ def by_label(belief: Belief, covariance: Floats, period: Floats, kernel: float) 
     """The objects as components, by labels, each with its kernel about it and `covariance` more."""
     label, first, group = np.unique(belief.label, return_index=True, return_inverse=True)
     weight, state = belief.weight, belief.state.copy()
-    existence = np.bincount(group, weight, len(label))
+    existence = np.asarray(np.bincount(group, weight, len(label)), dtype=np.float64)
     if len(label) and kernel > 0.0:
         num = int(belief.family.max()) + 1
         cloud = num * group + belief.family
-        widen(cloud, *moments(cloud, num * len(label), weight, state, period), period, kernel, state, covariance)
+        mean, V = moments(cloud, num * len(label), weight, state, period)
+        widen(cloud, mean, V, period, kernel, state, covariance)
     offset = np.append(first, len(group))
     share = weight / np.maximum(existence, 1e-300)[group]
     return Bernoullis(label, existence, Components(offset, share, belief.kind, state, covariance))
@@ -155,12 +156,10 @@ def step(
         start, table, parent, unseen.offset, mass, share, knobs.max_shared, NUM_SWEEPS, random
     )
     old = order[place]
-    missing, there = 1.0 - view.detection[old], survival[old]
-    stays = there * missing / np.maximum(1.0 - there * view.detection[old], LEAST_MISS)
-    kept = (made >= 0) | (rng.random(len(old)) < np.maximum(stays, there * LEAST_MISS))
-    parts = Components(
-        np.zeros(1), *(np.concatenate(pair) for pair in zip(objects.components[1:], unseen[1:], strict=True))
-    )
+    there, detection = survival[old], view.detection[old]
+    stays = there * np.maximum(1.0 - detection, LEAST_MISS) / np.maximum(1.0 - there * detection, LEAST_MISS)
+    kept = (made >= 0) | (rng.random(len(old)) < stays)
+    parts = side_by_side(objects.components, unseen)
     component = np.concatenate([old[kept], rows + new_part])
     particle, measured = np.concatenate([whose[kept], new_whose]), np.concatenate([made[kept], new_made])
     state, log_corrections = meet(model, scan, objects, parts, view, component, measured, rng)
@@ -169,8 +168,8 @@ def step(
     label = np.concatenate([belief.label[old[kept]], number * STRIDE + new_made])
     family = np.concatenate([belief.family[old[kept]], new_part - unseen.offset[new_made]])
     by = np.lexsort((particle, label))
-    found = (value[by] for value in (label, particle, parts.kind[component], state, family))
-    posterior = Belief(scan.time, log_weight - log_more, *found)
+    kind = parts.kind[component]
+    posterior = Belief(scan.time, log_weight - log_more, label[by], particle[by], kind[by], state[by], family[by])
     return posterior, Facts(log_factor + log_more, int(loopy > 0)), worth
 
 

@@ -34,8 +34,8 @@ def weigh(  # type: ignore[no-untyped-def]
     order[start[n + 1] - 1], components with covariances P (R, n, n) that are alive with survival (R,).
 
     Returns (table: offset (R + 1,) in that order, measurement, ratio, missed (R,)), log p(Z | particle) (N,) but for
-    the expected number of detections, masses of the components of unseen objects (U,), rho (M,), their share in what no old
-    object made (M,), and groups by belief propagation."""
+    the expected number of detections, masses of the components of unseen objects (U,), the share rho / kappa of these
+    in what no old object made (M,), and groups by belief propagation."""
     rows, num, M, d, n = len(order), len(start) - 1, len(values), len(period), new_mean.shape[1]
     mass, rho = unseen_mass(
         new_offset, new_weight, new_kind, new_P, rows,

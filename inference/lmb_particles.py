@@ -116,8 +116,8 @@ def predict(
         return belief, covariance
     existence, weight = belief.existence.copy(), belief.weight.flatten()
     survive(belief.offset, existence, weight, survival)
-    weight, state = weight.reshape(-1, num), state.reshape(-1, num, size)
-    belief = belief._replace(existence=existence, weight=weight, state=state)
+    shape = belief.weight.shape
+    belief = belief._replace(existence=existence, weight=weight.reshape(shape), state=state.reshape(*shape, size))
     arrived = model.arrivals(seconds)
     if not len(arrived.label):
         return belief, covariance
@@ -125,11 +125,9 @@ def predict(
     component = components_of(parts.offset, parts.weight, range(len(label)), num, rng)
     state = draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size)))
     even = np.full((len(label), num), 1.0 / num)
-    kind, state, component = (
-        part.reshape(-1, num, *part.shape[1:]) for part in (parts.kind[component], state, component)
-    )
-    family = component - parts.offset[:-1, None]
-    covariance = np.concatenate([covariance, np.zeros((len(component.ravel()), size, size))])
+    kind, state = parts.kind[component].reshape(-1, num), state.reshape(-1, num, size)
+    family = component.reshape(-1, num) - parts.offset[:-1, None]
+    covariance = np.concatenate([covariance, np.zeros((len(component), size, size))])
     return together(belief, Belief(belief.time, label, arrived.existence, even, kind, state, family)), covariance
 
 
@@ -196,11 +194,18 @@ def meet(
     return state, log_corrections(state, seen, detected, component, measurement, *about, *rest)
 
 
+def side_by_side(a: Components, b: Components) -> Components:
+    """The groups of both."""
+    offset = np.concatenate([a.offset, a.offset[-1] + b.offset[1:]])
+    return Components(offset, *(np.concatenate(pair) for pair in zip(a[1:], b[1:], strict=True)))
+
+
 def look(model: HasObjects, scan: Timed, objects: Bernoullis, kind: Ints, state: Floats) -> tuple[Floats, Floats]:
     """h (D, d) and p_D (D,) of further states (D, n), which objects may hide, each by its heaviest component."""
     parts, num = objects.components, len(state)
     best = np.array([a + parts.weight[a:b].argmax() for a, b in itertools.pairwise(parts.offset)], dtype=np.int64)
-    few = Components(np.arange(len(best) + 1), np.ones(len(best)), *(part[best] for part in parts[2:]))
+    one = np.arange(len(best) + 1)
+    few = Components(one, np.ones(len(best)), parts.kind[best], parts.mean[best], parts.covariance[best])
     flat = np.broadcast_to(np.zeros((state.shape[1], state.shape[1])), (num, state.shape[1], state.shape[1]))
     more = Components(np.array([0, num]), np.full(num, 1.0 / num), kind, state, flat)
     view = model.view(scan, objects._replace(components=few), more)
@@ -223,9 +228,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
         raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
     born, kept = np.flatnonzero(first > knobs.faint), existence > knobs.faint
     left_out = existence[~kept].sum() + first[first <= knobs.faint].sum()
-    parts = Components(
-        np.zeros(1), *(np.concatenate(pair) for pair in zip(objects.components[1:], unseen[1:], strict=True))
-    )
+    parts = side_by_side(objects.components, unseen)
     fresh = components_of(unseen.offset, mass, born, num, rng)
     whose = np.concatenate([component[kept].ravel(), old + fresh])
     measured = np.concatenate([chosen[kept].ravel(), np.repeat(born, num)])
@@ -253,7 +256,8 @@ def tell(belief: Belief, report: float, period: Floats, num_kinds: int) -> Objec
     group = np.repeat(np.arange(num), told.weight.shape[1])
     mean, covariance = moments(group, num, told.weight.ravel(), told.state.reshape(-1, size), period)
     kind = np.bincount(group * num_kinds + told.kind.ravel(), told.weight.ravel(), num * num_kinds)
-    return Objects(told.label, told.existence, mean, covariance, kind.reshape(num, num_kinds))
+    share = np.asarray(kind, dtype=np.float64).reshape(num, num_kinds)
+    return Objects(told.label, told.existence, mean, covariance, share)
 
 
 def run(

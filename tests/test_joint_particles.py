@@ -191,3 +191,21 @@ def test_settings_out_of_range_are_refused() -> None:
         joint_particles.run(small(), WINDOW, ess=0.0)
     with pytest.raises(InputError, match="joint_particles needs a model of many objects"):
         joint_particles.run(object(), [])  # type: ignore[arg-type]
+
+
+def test_detection_that_changes_over_the_noise_of_a_step_is_weighed_state_by_state() -> None:
+    """At the edge of the view: p(no measurement) = E[1 - s p_D(x)], the expectation over x ~ N(19, sd^2) by quadrature.
+    Factors lie within 0 and 1 and average to about a half: four standard errors of their mean are below 4 / sqrt(N)."""
+    kind, num = Kind(noise=(10.0, 10.0), speed=(0.0, 2.0), lifetime=5.0), 20_000
+    model = replace(small(), kinds=(kind,))
+    state, none = np.tile([19.0, 0.0, 0.0, 0.0], (num, 1)), np.zeros(num, dtype=np.int64)
+    belief = joint_particles.Belief(0.0, np.full(num, -math.log(num)), none, np.arange(num), none, state, none)
+    scan, knobs = Scan("plots", STEP, np.zeros((0, 2)), POSE), joint_particles.Knobs(num_particles=num, kernel=0.0)
+    belief, facts, _ = joint_particles.step(model, belief, scan, 1, knobs, 0)
+    node, weight = np.polynomial.hermite_e.hermegauss(100)
+    x = 19.0 + 10.0 * math.sqrt(STEP**3 / 3) * node
+    survival, detection = math.exp(-STEP / kind.lifetime), 0.8 / (1.0 + np.exp((np.abs(x) - 20.0) / 0.5))
+    expected = weight @ (1.0 - survival * detection) / weight.sum()
+    assert math.exp(facts.log_factor) == pytest.approx(expected, rel=4 / math.sqrt(num))
+    there = weight @ (survival * (1.0 - detection)) / weight.sum() / expected
+    assert joint_particles.tell(belief, 0.0, model.period, 1).existence[0] == pytest.approx(there, abs=0.02)

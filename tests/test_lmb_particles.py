@@ -249,6 +249,13 @@ def test_objects_come_from_known_places() -> None:
     np.testing.assert_allclose(told.mean[0, :2], place.position, atol=5 * place.std / math.sqrt(5000))
 
 
+def test_objects_survive_as_long_as_their_kind_lives() -> None:
+    model = plots()
+    belief = certain(np.zeros(4), np.ones(4), 100, 0, existence=0.8)
+    moved, _ = lmb_particles.predict(model, belief, 1.3, 0, np.random.default_rng(0))
+    assert moved.existence[0] == pytest.approx(0.8 * math.exp(-1.3 / model.kinds[0].lifetime), abs=1e-12)
+
+
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match="num_particles is 1"):
         lmb_particles.run(plots(), crossing(plots(), 1), num_particles=1)

@@ -21,9 +21,7 @@ SMALL = 1e-12  # posterior components of less weight are left out before anythin
 
 @njit(cache=True, error_model="numpy")
 def propagate(offset, existence, weight, covariance, slope, noise, survival):  # type: ignore[no-untyped-def]
-    """P <- F P F' + L L' in place, and what survival leaves of existence and weights:
-
-    r <- r sum_c w_c s_c,   w_c <- w_c s_c / sum"""
+    """P <- F P F' + L L' in place, and what survival leaves of existence and weights."""
     num, n, m = noise.shape
     half, full = np.empty((n, n)), np.empty((n, n))
     for c in range(num):
@@ -46,6 +44,14 @@ def propagate(offset, existence, weight, covariance, slope, noise, survival):  #
         for i in range(n):
             for j in range(i + 1):
                 P[i, j] = P[j, i] = full[i, j]
+    survive(offset, existence, weight, survival)
+
+
+@njit(cache=True, error_model="numpy")
+def survive(offset, existence, weight, survival):  # type: ignore[no-untyped-def]
+    """What survival leaves of existence and weights, in place:
+
+    r <- r sum_c w_c s_c,   w_c <- w_c s_c / sum"""
     for t in range(len(existence)):
         total = 0.0
         for c in range(offset[t], offset[t + 1]):

@@ -1,0 +1,265 @@
+"""The labeled multi-Bernoulli filter with particles: against Kalman, the Gaussian filter, and the truth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from inference import lmb, lmb_particles
+from inference.object_particles import draw, log_corrections, moments, widen
+from inference.tracks import Tracks
+from models.multi_object import no_objects
+from models.objects.motion import ConstantTurn, ConstantVelocity
+from models.objects.scans import Recording, Scan
+from models.objects.scene import simulate_scan
+from models.objects.sensors import Position, Radar, RangeBearing
+from models.objects.traffic import Kind, Place, Traffic
+from models.program import InputError
+
+Floats = NDArray[np.float64]
+POSE = np.zeros(3)
+FRONT = (3.5, 0.0, 0.0)
+
+
+def plots(detection: float = 0.9, clutter: float = 2.0) -> Traffic:
+    """Linear: positions in a square of 80 m."""
+    sensor = Position(name="plots", noise_std=(1.0, 1.0), detection=detection, clutter=clutter, extent=40.0)
+    return Traffic((sensor,), ConstantVelocity(), (Kind(noise=(1.0, 1.0), speed=(0.0, 3.0)),), unseen_density=3e-4)
+
+
+def certain(mean: Floats, std: Floats, num: int, seed: int, existence: float = 1.0) -> lmb_particles.Belief:
+    """One object at time 0, of N(mean, diag std^2)."""
+    state = mean + std * np.random.default_rng(seed).standard_normal((1, num, len(mean)))
+    none = np.zeros((1, num), dtype=np.int64)
+    even = np.full((1, num), 1.0 / num)
+    return lmb_particles.Belief(0.0, np.zeros(1, dtype=np.int64), np.full(1, existence), even, none, state, none)
+
+
+def test_one_object_that_is_always_detected_is_filtered_as_by_kalman() -> None:
+    """Each scan draws N particles anew, which moves the mean by at most sd / sqrt(N); over K scans these add up in
+    squares: 5 sd sqrt(K / N) is five standard errors and more."""
+    model, num, count, dt = plots(detection=1.0, clutter=1e-9), 20_000, 8, 0.2
+    model = Traffic(model.sensors, model.motion, model.kinds, unseen_density=1e-12)
+    mean, std = np.array([5.0, -3.0, 2.0, 1.0]), np.array([2.0, 2.0, 3.0, 3.0])
+    belief, P = certain(mean, std, num, 0), np.diag(std**2)
+    F, H = np.eye(4) + dt * np.eye(4, k=2), np.eye(2, 4)
+    Q = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+    rng = np.random.default_rng(1)
+    for number in range(count):
+        z = np.array([5.0, -3.0]) + dt * (number + 1) * np.array([3.0, 0.0]) + rng.standard_normal(2)
+        scan = Scan("plots", dt * (number + 1), z[None], POSE)
+        belief, _ = lmb_particles.step(model, belief, scan, number, lmb_particles.Knobs(num_particles=num), 0)
+        mean, P = F @ mean, F @ P @ F.T + Q
+        gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(2))
+        mean, P = mean + gain @ (z - H @ mean), P - gain @ H @ P
+        found = lmb_particles.tell(belief, 0.0, model.period, 1)
+        sd = np.sqrt(np.diag(P))
+        assert np.all(np.abs(found.mean[0] - mean) < 5 * sd * math.sqrt(count / num))
+        error = np.abs(found.covariance[0] - P) / np.outer(sd, sd)
+        assert np.all(error < 5 * math.sqrt(2 * count / num))
+    assert found.existence[0] > 0.999
+
+
+def crossing(model: Traffic, count: int) -> list[Scan]:
+    """Two objects that meet."""
+    kind = np.zeros(2, dtype=np.int64)
+    way = [np.array([[t - 3.0, 2.0, 2.0, 0.0], [t - 3.0, -2.0, 2.0, 0.0]]) for t in 0.5 * np.arange(count)]
+    return [simulate_scan(model, "plots", 0.5 * t, POSE, kind, x, 10 + t)[0] for t, x in enumerate(way)]
+
+
+def test_twenty_thousand_particles_agree_with_gaussian_mixtures_where_all_is_linear() -> None:
+    """Ten runs of 2000 particles: their mean is within 4.5 of its standard errors, and what 1 / N leaves of bias.
+
+    Without kernels, which blur objects of several modes; and within the view, on whose edge p_D is not constant."""
+    model, runs, num = plots(), 10, 2000
+    scans = crossing(model, 7)
+    exact, belief = lmb.Knobs(least=1e-9, merge=1e-6, most=200), lmb.Belief(None, no_objects(4))
+    for number, scan in enumerate(scans):
+        belief, facts = lmb.step(model, belief, scan, number, exact)
+    parts = belief.objects.components
+    middle = {
+        label: parts.weight[a:b] @ parts.mean[a:b]
+        for label, a, b in zip(belief.objects.label, parts.offset[:-1], parts.offset[1:], strict=True)
+    }
+    expected = {
+        label: r
+        for label, r in zip(belief.objects.label, belief.objects.existence, strict=True)
+        if r > 0.05 and np.abs(middle[label][:2]).max() < 30.0
+    }
+    assert len(expected) >= 4
+    existence, mean, factor = [], [], []
+    for seed in range(runs):
+        found, knobs = lmb_particles.nobody(4, num), lmb_particles.Knobs(num_particles=num, kernel=0.0)
+        for number, scan in enumerate(scans):
+            found, said = lmb_particles.step(model, found, scan, number, knobs, seed)
+        told, factor = lmb_particles.tell(found, 0.0, model.period, 1), [*factor, said.log_factor]
+        row = {label: i for i, label in enumerate(told.label)}
+        existence.append([told.existence[row[label]] for label in expected])
+        mean.append([told.mean[row[label]] for label in expected])
+    for values, target in (
+        (np.array(existence), np.array(list(expected.values()))),
+        (np.array(mean), np.array([middle[label] for label in expected])),
+        (np.array(factor), facts.log_factor),
+    ):
+        error = values.std(0, ddof=1) / math.sqrt(runs)
+        assert np.all(np.abs(values.mean(0) - target) < 4.5 * error + 0.01)
+        assert np.all(error < 0.5)
+
+
+def three_sensors(laser: float) -> Traffic:
+    """A radar, a laser and a camera that look ahead."""
+    radar = Radar(
+        name="radar", mount=FRONT, angle=2.1, noise_std=(0.3, math.radians(1.0), 0.15), detection=0.9, clutter=3.0
+    )
+    ranged = RangeBearing(name="laser", mount=FRONT, angle=3.6, noise_std=(laser, math.radians(0.15)), clutter=3.0)
+    camera = RangeBearing(
+        name="camera", angle=1.7, reach=(0.0, 120.0), noise_std=(4.0, math.radians(0.15)), clutter=2.0, births=False
+    )
+    return Traffic((radar, ranged, camera), ConstantTurn(), (Kind(lifetime=1e4),), unseen_density=1e-4)
+
+
+def drawn(model: Traffic, num: int, duration: float, seed: int) -> tuple[Recording, Floats]:
+    """Objects that move as the model says, and where they are at each scan (T, num, n)."""
+    rng = np.random.default_rng(seed)
+    x, kind = np.zeros((num, 6)), np.zeros(num, dtype=np.int64)
+    x[:, 0], x[:, 1] = 40.0 + 5.0 * rng.standard_normal(num), np.linspace(-20.0, 20.0, num)
+    x[:, 2], x[:, 3] = rng.uniform(-math.pi, math.pi, num), 8.0 + 2.0 * rng.standard_normal(num)
+    scans, truth, last = list[Scan](), list[Floats](), 0
+    for tick in range(round(100 * duration)):
+        for name, (first, period) in {"radar": (0, 7), "laser": (2, 8), "camera": (3, 7)}.items():
+            if tick >= first and (tick - first) % period == 0:
+                if tick > last:
+                    moved = model.move(kind, x, (tick - last) / 100)
+                    e = rng.standard_normal(moved.noise.shape[::2])
+                    x, last = moved.mean + np.einsum("inm,im->in", moved.noise, e), tick
+                scans.append(simulate_scan(model, name, tick / 100, POSE, kind, x, rng)[0])
+                truth.append(x)
+    return Recording(tuple(scans)), np.array(truth)
+
+
+def nees(tracks: Tracks, truth: Floats, start: float) -> float:
+    """Mean of e' P^-1 e over the positions of confirmed objects, the nearest true one being meant: two, if right."""
+    found = list[float]()
+    for t in np.flatnonzero(tracks.time >= start):
+        told = tracks.at(int(t))
+        for row in np.flatnonzero(told.existence > 0.5):
+            off = truth[t, :, :2] - told.mean[row, :2]
+            e = off[np.square(off).sum(1).argmin()]
+            if e @ e < 25.0:
+                found.append(float(e @ np.linalg.solve(told.covariance[row, :2, :2], e)))
+    assert len(found) > 30
+    return float(np.mean(found))
+
+
+def mean_nees(laser: float, seeds: tuple[int, ...], **settings: float) -> float:
+    model = three_sensors(laser)
+    cases = [drawn(model, 2, 2.5, seed) for seed in seeds]
+    return float(
+        np.mean([nees(lmb_particles.run(model, c.scans, seed=0, **settings), x, 1.0) for c, x in cases])  # type: ignore[arg-type]
+    )
+
+
+SEEDS = (0, 1, 2, 3, 4, 5)
+
+
+def test_errors_are_as_large_as_the_particles_say() -> None:
+    assert 1.6 < mean_nees(0.1, SEEDS) < 2.4
+
+
+def test_without_kernels_an_accurate_laser_leaves_a_cloud_that_is_too_sure() -> None:
+    assert mean_nees(0.02, SEEDS[:1], num_particles=500, kernel=0.0) > 5.0
+
+
+def test_an_object_outside_every_view_keeps_its_existence() -> None:
+    sensor = RangeBearing(name="front", noise_std=(0.1, 0.01), angle=1.0, reach=(0.0, 60.0), detection=0.99)
+    model = Traffic((sensor,), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),))
+    belief = certain(np.array([0.0, 30.0, 0.0, 0.0]), np.full(4, 0.1), 100, 0, existence=0.7)
+    for number in range(5):
+        scan, knobs = Scan("front", 0.0, np.zeros((0, 2)), POSE), lmb_particles.Knobs(num_particles=100)
+        belief, _ = lmb_particles.step(model, belief, scan, number, knobs, 0)
+    np.testing.assert_allclose(belief.existence, 0.7, atol=1e-12)
+
+
+def test_the_same_seed_gives_the_same_bits_and_late_scans_are_taken() -> None:
+    model = plots()
+    scans = crossing(model, 6)
+    scans[3], scans[4] = scans[4], scans[3]
+    first, again, other = (lmb_particles.run(model, scans, seed=s, num_particles=200) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first.mean, again.mean)
+    assert first.log_evidence == again.log_evidence != other.log_evidence
+    assert first.info["late"] == 1
+
+
+def test_weights_of_draws_are_those_of_importance_sampling() -> None:
+    """log w = log p_D(x) N(z; h(x), R) N(x; m, P) / (p_D(m) N(z; h(m), S) q(x)), q the density that was drawn from."""
+    from scipy.stats import multivariate_normal as normal
+
+    rng = np.random.default_rng(0)
+    m, H, R, z = rng.standard_normal(3), rng.standard_normal((2, 3)), np.diag([0.3, 0.5]), np.array([0.4, -0.3])
+    P = 0.5 * np.eye(3) + 0.2
+    view = (m[None, :2], H[None], z[None], R[None], np.zeros(1, dtype=np.int64), np.full(2, np.inf))
+    component, measured = np.zeros(20_000, dtype=np.int64), np.zeros(20_000, dtype=np.int64)
+    x = draw(component, measured, m[None], P[None], *view, rng.standard_normal((20_000, 3)))
+    S = H @ P @ H.T + R
+    gain = P @ H.T @ np.linalg.inv(S)
+    centre, V = m + gain @ (z - m[:2]), P - gain @ H @ P
+    np.testing.assert_allclose(x.mean(0), centre, atol=5 * np.sqrt(np.diag(V).max() / len(x)))
+    np.testing.assert_allclose(np.cov(x.T), V, atol=5 * np.diag(V).max() * math.sqrt(2 / len(x)))
+    seen, detected = np.sin(x[:, :2]), 0.5 + 0.1 * np.tanh(x[:, 0])
+    found = log_corrections(x, seen, detected, component, measured, m[None], *view[:2], np.full(1, 0.7), *view[2:])
+    log_q = normal(centre, V).logpdf(x)
+    likelihood = normal(np.zeros(2), R).logpdf(z - seen) + np.log(detected)
+    expected = likelihood + normal(m, P).logpdf(x) - log_q - math.log(0.7) - normal(m[:2], S).logpdf(z)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_angles_are_averaged_as_angles() -> None:
+    period, rng = np.array([np.inf, math.tau]), np.random.default_rng(0)
+    x, weight, one = rng.normal([3.0, math.pi], [1.0, 0.3], (500, 2)), rng.random(500), np.zeros(500, dtype=np.int64)
+    turned = x + np.outer(rng.integers(-2, 3, 500), [0.0, math.tau])
+    mean, V = moments(one, 1, weight, x, period)
+    found, spread = moments(one, 1, weight, turned, period)
+    assert abs(math.remainder(found[0, 1] - mean[0, 1], math.tau)) < 1e-9
+    np.testing.assert_allclose(spread, V, atol=1e-9)
+    np.testing.assert_allclose(V[0], np.cov(x.T, aweights=weight, bias=True), atol=1e-9)
+
+
+def test_kernels_leave_the_moments_of_a_cloud_as_they_are() -> None:
+    period, rng = np.array([np.inf, math.tau]), np.random.default_rng(0)
+    x, weight, one = rng.normal([3.0, math.pi], [1.0, 0.3], (500, 2)), rng.random(500), np.zeros(500, dtype=np.int64)
+    mean, V = moments(one, 1, weight, x, period)
+    P = np.zeros((500, 2, 2))
+    widen(one, mean, V, period, 0.4, x, P)
+    after, inner = moments(one, 1, weight, x, period)
+    np.testing.assert_allclose(after, mean, atol=1e-9)
+    np.testing.assert_allclose(inner + P[0], V, atol=1e-9)
+
+
+def test_objects_come_from_known_places() -> None:
+    model = plots()
+    place = Place((10.0, 5.0), 2.0, 0.5)
+    model = Traffic(model.sensors, model.motion, model.kinds, 3e-4, places=(place,))
+    belief = lmb_particles.nobody(4, 5000)
+    moved, _ = lmb_particles.predict(model, belief, 0.4, 3, np.random.default_rng(0))
+    assert moved.existence[0] == pytest.approx(-math.expm1(-model.arrived(0.4)[1].sum()))
+    told = lmb_particles.tell(moved, 0.0, model.period, 1)
+    np.testing.assert_allclose(told.mean[0, :2], place.position, atol=5 * place.std / math.sqrt(5000))
+
+
+def test_objects_survive_as_long_as_their_kind_lives() -> None:
+    model = plots()
+    belief = certain(np.zeros(4), np.ones(4), 100, 0, existence=0.8)
+    moved, _ = lmb_particles.predict(model, belief, 1.3, 0, np.random.default_rng(0))
+    assert moved.existence[0] == pytest.approx(0.8 * math.exp(-1.3 / model.kinds[0].lifetime), abs=1e-12)
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(InputError, match="num_particles is 1"):
+        lmb_particles.run(plots(), crossing(plots(), 1), num_particles=1)
+    with pytest.raises(InputError, match=r"kernel is 1.5"):
+        lmb_particles.run(plots(), crossing(plots(), 1), kernel=1.5)
+    with pytest.raises(InputError, match="lmb_particles needs a model of many objects"):
+        lmb_particles.run(object(), [])  # type: ignore[arg-type]

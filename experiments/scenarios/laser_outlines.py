@@ -34,8 +34,8 @@ Ints = NDArray[np.int64]
 GRAZING = 1e-3  # a side is seen by beams that meet it at a larger angle than this [rad]
 OPEN = 5.0  # how wide a corner is where something hides it, to weigh it by [m]
 NUM, WIDE, SHARP = 90, 5.0, 4.0  # headings at once; spread over so many standard deviations; steps that must resolve one
-# a side seen to be shorter than this; the other one's usual size, and how far from it that may be [m]
-USUAL = np.array([(1.2, 1.2, 0.6), (3.0, 4.5, 2.0), (np.inf, 1.8, 0.5)])
+USUAL = np.array([(1.2, 1.2), (3.0, 4.5), (np.inf, 1.8)])  # a side shorter than this; the other one's usual size [m]
+ASTRAY = 15.0  # the d of an unseen size: wide, for what is told of sizes so must be little after a hundred scans [m]
 LONGEST = 20.0  # of a side, as it seems where beams graze it [m]
 ODD = 6.0  # standard deviations of the sum of squares beyond which points are no rectangle
 
@@ -158,7 +158,7 @@ def measured(
     weight, open_end = weight[own] / weight[own].sum(), unseen[own][0]
     with np.errstate(invalid="ignore"):
         longest = np.where(points[own][:, ::-1] > 1, np.clip(far_seen - near, 0.0, LONGEST), 0.0)  # of sides, as seen
-    usual, astray = USUAL[np.searchsorted(USUAL[:, 0], weight @ longest)[::-1], 1:].T
+    usual = USUAL[np.searchsorted(USUAL[:, 0], weight @ longest)[::-1], 1]
     far = np.where(open_end[:2], near + np.maximum(usual, longest), far_seen)
     # faces (near along, near across, far along, far across) are linear in the corner
     faces = np.zeros((len(a), 4, 2))
@@ -177,7 +177,7 @@ def measured(
     for i in np.flatnonzero(open_end):
         j = shape[best][:, (2, 3, 0, 1)[i]]
         dj = (shape_of(a[best : best + 1] + 1e-4) - shape_of(a[best : best + 1] - 1e-4))[0, :, (2, 3, 0, 1)[i]] / 2e-4
-        covariance += UNSEEN**2 * np.outer(j, j) + astray[i % 2] ** 2 * turned * np.outer(dj, dj)
+        covariance += UNSEEN**2 * np.outer(j, j) + ASTRAY**2 * turned * np.outer(dj, dj)
     return mean, 0.5 * (covariance + covariance.T)
 
 

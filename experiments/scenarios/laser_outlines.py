@@ -13,7 +13,9 @@ e1 along a, and the right one, at e2 across. Beam i, psi_i = bearing - a, ends a
 
                    exp(-sum of squares / 2) / sqrt(det information)
 
-Of rectangles that leave different ends unseen those are taken that weigh most. Usual sizes say nothing of a size that is
+Of rectangles that leave different ends unseen those are taken that leave most, unless they weigh next to nothing: whichever
+weighs most would show a side wherever noise looks like one. (But where the heading is all but open, in which case those
+that weigh most are taken: a pedestrian seen across a corner is no wide side.) Usual sizes say nothing of a size that is
 unseen, but of what the error e of a heading does to the middle behind it: a size s, put at m +- d, turns by e, so that
 (m e)^2 + (d e)^2 along dj / da is in the noise. Of a lorry seen from behind that is too little, as of a car."""
 
@@ -26,12 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.scenarios.laser_beams import Laser, Sweep
-from experiments.scenarios.laser_boxes import FEWEST, GAP, beams_of
+from experiments.scenarios.laser_boxes import FEWEST, GAP, beams_of, points_of
 from models.objects.outline import UNSEEN
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 GRAZING = 1e-3  # a side is seen by beams that meet it at a larger angle than this [rad]
+POSSIBLE = 0.02  # weight from which on it is believed that more ends are unseen
+TURNED = 0.1  # where headings are told worse than this, sides are not told apart, either [rad]
+APART = 5.0  # to the next point, of clusters of fewer than three: a part of a side that beams graze is nearer [m]
 OPEN = 5.0  # how wide a corner is where something hides it, to weigh it by [m]
 NUM, WIDE, SHARP = 90, 5.0, 4.0  # headings at once; spread over so many standard deviations; steps that must resolve one
 USUAL = np.array([(1.2, 1.2), (3.0, 4.5), (np.inf, 1.8)])  # a side shorter than this; the other one's usual size [m]
@@ -60,12 +65,13 @@ class Corners(NamedTuple):
 
 
 def outlines(sweep: Sweep, laser: Laser) -> Outlines:
-    """The outline of each cluster that has three points or more, one end at least, and the shape of a rectangle."""
+    """The outline of each cluster that shows an end at least and has the shape of a rectangle. Those of one or two points
+    are used where nothing else is near: without them small objects far away would be seen when they seem large only."""
     padded = np.concatenate([[0.0], sweep.distance, [0.0]])
     found = list[tuple[Floats, Floats]]()
     for beams in beams_of(sweep):
         hidden = (padded[beams[0]] < sweep.distance[beams[0]], padded[beams[-1] + 2] < sweep.distance[beams[-1]])
-        if len(beams) < FEWEST or all(hidden):
+        if all(hidden) or (len(beams) < FEWEST and not alone(sweep, beams)):
             continue
         fit = fit_outline(sweep.bearing[beams], sweep.distance[beams], laser, hidden)
         if fit is not None:
@@ -74,6 +80,13 @@ def outlines(sweep: Sweep, laser: Laser) -> Outlines:
         return Outlines(np.zeros((0, 5)), np.zeros((0, 5, 5)))
     values, noise = (np.array(part) for part in zip(*found, strict=True))
     return Outlines(values, noise)
+
+
+def alone(sweep: Sweep, beams: Ints) -> bool:
+    """Whether nothing else is near, of which the points of these beams may be a part."""
+    others = np.setdiff1d(np.flatnonzero(np.isfinite(sweep.distance)), beams)
+    gap = points_of(sweep, others)[:, None] - points_of(sweep, beams)
+    return bool(np.hypot(gap[..., 0], gap[..., 1]).min(initial=np.inf) > APART)
 
 
 def fit_outline(
@@ -147,12 +160,15 @@ def measured(
         slope = np.tan(ends)
         gap = np.abs(near) * laser.step / np.square(np.cos(ends))
     points = np.stack([num - k, k], -1)
-    seen = (points >= 2) & (np.cos(ends) > GRAZING) & (gap < 0.5 * GAP) & ~np.array(hidden[::-1])
+    seen = (points >= min(num, 2)) & (np.cos(ends) > GRAZING) & (gap < 0.5 * GAP) & ~np.array(hidden[::-1])
     far_seen = (near * slope)[:, ::-1]  # (P, 2) along a, across it
     # what nobody sees: far ends along a and across it, and near sides without points that something hides
     unseen = np.concatenate([~seen[:, ::-1], (points == 0) & np.array([hidden[1], hidden[0]])], 1)
     code = unseen @ (1 << np.arange(4))
-    chosen = int(np.bincount(code, weight).argmax())
+    share = np.bincount(code, weight, minlength=16)
+    open_ends = np.array([i.bit_count() for i in range(16)])
+    sure = math.sqrt(weight @ np.square(a - a[weight.argmax()])) < TURNED
+    chosen = int(np.lexsort((share, np.where(share > POSSIBLE, open_ends, -1) * sure))[-1])
     own = code == chosen
     a, near, far_seen, slope, gap = a[own], near[own], far_seen[own], slope[own], gap[own]
     weight, open_end = weight[own] / weight[own].sum(), unseen[own][0]

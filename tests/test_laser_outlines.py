@@ -170,12 +170,13 @@ def test_sizes_of_a_car_that_turns_are_found_as_well_as_they_say() -> None:
 
 
 def test_a_car_seen_from_behind_keeps_the_length_it_was_thought_to_have() -> None:
-    """After 60 scans of its rear: the width is known, and the length what it was before, though it is another."""
+    """After 60 scans of its rear: the width is known, and the length what it was before, though it is another. It is
+    thought to be known better than before, by linearisation (experiments.scenarios.laser_outlines), but not well."""
     way = np.column_stack([15.0 + 0.8 * np.arange(60), np.zeros((60, 2))])
     mean, covariance, _ = surest(follow(way, (5.3, 1.7), 0))
     assert mean[7] == pytest.approx(1.7, abs=0.03)
     assert mean[6] == pytest.approx(4.5, abs=0.15)
-    assert math.sqrt(covariance[6, 6]) == pytest.approx(0.5, abs=0.05)
+    assert 0.28 < math.sqrt(covariance[6, 6]) <= 0.51
     rear = mean[0] - 0.5 * mean[6]
     assert rear == pytest.approx(way[-1, 0] - 0.5 * 5.3, abs=0.05)
 

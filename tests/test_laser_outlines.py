@@ -154,7 +154,7 @@ def round_a_corner(seed: int) -> tuple[Floats, Floats, Floats]:
     length, width = 4.5 + 0.5 * rng.standard_normal(), 1.8 + 0.2 * rng.standard_normal()
     heading = -math.pi / 2 + np.clip(0.06 * (np.arange(50) - 15), 0.0, math.pi / 2)
     path = np.cumsum(0.6 * np.stack([np.cos(heading), np.sin(heading)], -1), 0)
-    way = np.column_stack([path + [18.0, 9.0], heading])
+    way = np.column_stack([path + np.array([18.0, 9.0]), heading])
     mean, covariance, _ = surest(follow(way, (length, width), seed))
     return mean[6:], covariance[6:, 6:], np.array([length, width])
 

@@ -13,11 +13,11 @@ e1 along a, and the right one, at e2 across. Beam i, psi_i = bearing - a, ends a
 
                    exp(-sum of squares / 2) / sqrt(det information)
 
-Of rectangles that leave different ends unseen those are taken that leave most, unless they weigh next to nothing: whichever
-weighs most would show a side wherever noise looks like one. (But where the heading is all but open, in which case those
-that weigh most are taken: a pedestrian seen across a corner is no wide side.) Usual sizes say nothing of a size that is
+Of rectangles that leave different ends unseen those are taken that leave most, unless they weigh next to nothing:
+whichever weighs most would show a side wherever noise looks like one. (But where the heading is all but open, those
+that weigh most: a pedestrian seen across a corner is no wide side.) Usual sizes say nothing of a size that is
 unseen, but of what the error e of a heading does to the middle behind it: a size s, put at m +- d, turns by e, so that
-(m e)^2 + (d e)^2 along dj / da is in the noise. Of a lorry seen from behind that is too little, as of a car."""
+(m e)^2 + (d e)^2 along dj / da is in the noise."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ NUM, WIDE, SHARP = (
     5.0,
     4.0,
 )  # headings at once; spread over so many standard deviations; steps that must resolve one
-USUAL = np.array([(1.2, 1.2), (3.0, 4.5), (np.inf, 1.8)])  # a side shorter than this; the other one's usual size [m]
+USUAL = np.array([(1.2, 1.2), (3.0, 4.5), (np.inf, 1.8)])  # a side shorter than this; the other one's usual size
 # the d of an unseen size. A filter whose heading is another than that of the fit takes the difference of the two
 # directions without information for information: of sixty scans of a rear, a length known to .5 m comes out at .31 m (at
 # .28 m with d = 4, .27 m with 15, and .5 m would be right)
@@ -73,8 +73,8 @@ class Corners(NamedTuple):
 
 
 def outlines(sweep: Sweep, laser: Laser) -> Outlines:
-    """The outline of each cluster that shows an end at least and has the shape of a rectangle. Those of one or two points
-    are used where nothing else is near: without them small objects far away would be seen when they seem large only."""
+    """The outline of each cluster that shows an end at least and has the shape of a rectangle. Those of one or two
+    points are used where nothing else is near: else small objects far away are seen when they seem large only."""
     padded = np.concatenate([[0.0], sweep.distance, [0.0]])
     found = list[tuple[Floats, Floats]]()
     for beams in beams_of(sweep):
@@ -129,7 +129,7 @@ def fit_outline(
 
 def corners(a: Floats, bearing: Floats, distance: Floats, laser: Laser, hidden: tuple[bool, bool]) -> Corners:
     """All rectangles at headings a (A,): with k = 0 ... n points right of the corner."""
-    num, std = len(bearing), laser.range_std
+    std = laser.range_std
     psi = bearing - a[:, None]
     left, right = np.cos(psi), np.sin(psi)  # (A, n)
     zero = np.zeros((len(a), 1))

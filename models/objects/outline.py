@@ -1,9 +1,9 @@
 """An outline: the rectangle that laser points show of an object, sides that nobody sees left open.
 
 An object is seen as several points, and those tell of a rectangle ([K15], section VI; Granstroem, Reuter, Meissner and
-Scheel 2014, who track cars under an assumed rectangular shape and weigh every partition of the points into objects). Here
-points are clustered and fitted before the filter, one measurement for each object, so that no filter changes. Length and
-width are in the state, and sides that are seen at different times add up.
+Scheel 2014, who track cars under an assumed rectangular shape and weigh partitions of the points into objects). Here
+points are clustered and fitted before the filter, one measurement for each object, so that no filter changes. Length
+and width are in the state, and sides that are seen at different times add up.
 
 What is measured is where the middle is and a tensor of the size,
 

@@ -38,15 +38,11 @@ POSSIBLE = 0.02  # weight from which on it is believed that more ends are unseen
 TURNED = 0.25  # where headings are told worse than this, sides are not told apart, either [rad]
 APART = 5.0  # to the next point, of clusters of fewer than three: a part of a side that beams graze is nearer [m]
 OPEN = 5.0  # how wide a corner is where something hides it, to weigh it by [m]
-NUM, WIDE, SHARP = (
-    90,
-    5.0,
-    4.0,
-)  # headings at once; spread over so many standard deviations; steps that must resolve one
-USUAL = np.array([(1.2, 1.2), (3.0, 4.5), (np.inf, 1.8)])  # a side shorter than this; the other one's usual size
-# the d of an unseen size. A filter whose heading is another than that of the fit takes the difference of the two
-# directions without information for information: of sixty scans of a rear, a length known to .5 m comes out at .31 m (at
-# .28 m with d = 4, .27 m with 15, and .5 m would be right)
+NUM, WIDE, SHARP = 90, 5.0, 4.0  # headings at once, spread over so many deviations; steps that resolve one
+USUAL = np.array([(1.2, 1.2), (3.0, 4.5), (np.inf, 1.8)])  # a side shorter than this; the other one's usual size [m]
+# The d of an unseen size. A filter whose heading is another than that of the fit takes the difference of the two
+# directions without information for information: of sixty scans of a rear, a length known to .5 m comes out at .31 m
+# (at .28 m with d = 4, .27 m with 15, and .5 m would be right).
 ASTRAY = 8.0
 LEAST = 1e-3  # nothing is known better: keeps covariances invertible beside UNSEEN [m]
 LONGEST = 20.0  # of a side, as it seems where beams graze it [m]

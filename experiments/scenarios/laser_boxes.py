@@ -30,6 +30,7 @@ from scipy.special import log_ndtr
 from experiments.scenarios.laser_beams import Laser, Sweep
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 GAP = 0.8  # [m]
 FEWEST = 3  # points of a cluster, and of a side that tells how long it is
 HEADINGS = np.radians(np.arange(90.0))  # of one side
@@ -77,21 +78,28 @@ def boxes(sweep: Sweep, laser: Laser) -> Boxes:
 
 def clusters(sweep: Sweep) -> list[Floats]:
     """Points (n, 2) [m] of each cluster, seen from the sensor, in the order of their first beams."""
-    hit = np.flatnonzero(np.isfinite(sweep.distance))
-    along = np.stack([np.cos(sweep.bearing[hit]), np.sin(sweep.bearing[hit])], -1)
-    points = sweep.distance[hit, None] * along
-    pairs = cKDTree(points).query_pairs(GAP, output_type="ndarray")
-    near = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(hit), len(hit)))
-    number, label = connected_components(near, directed=False)
     padded = np.concatenate([[np.inf], sweep.distance, [np.inf]])
     kept = list[Floats]()
-    for cluster in range(number):
-        own = np.flatnonzero(label == cluster)
-        beams = hit[own]
+    for beams in beams_of(sweep):
         hidden = padded[beams[0]] < sweep.distance[beams[0]] or padded[beams[-1] + 2] < sweep.distance[beams[-1]]
-        if len(own) >= FEWEST and not hidden:
-            kept.append(points[own])
+        if len(beams) >= FEWEST and not hidden:
+            kept.append(points_of(sweep, beams))
     return kept
+
+
+def beams_of(sweep: Sweep) -> list[Ints]:
+    """The beams (n,) of each cluster, in the order of the first ones."""
+    hit = np.flatnonzero(np.isfinite(sweep.distance))
+    pairs = cKDTree(points_of(sweep, hit)).query_pairs(GAP, output_type="ndarray")
+    near = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(hit), len(hit)))
+    number, label = connected_components(near, directed=False)
+    return [hit[label == cluster] for cluster in range(number)]
+
+
+def points_of(sweep: Sweep, beams: Ints) -> Floats:
+    """(n, 2) where beams end [m]."""
+    along = np.stack([np.cos(sweep.bearing[beams]), np.sin(sweep.bearing[beams])], -1)
+    return np.asarray(sweep.distance[beams, None] * along)
 
 
 def fit_box(points: Floats, laser: Laser) -> tuple[Floats, Floats, float, Floats] | None:

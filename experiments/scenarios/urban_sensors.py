@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from experiments.scenarios.laser_beams import Laser, sweep
 from experiments.scenarios.laser_boxes import boxes
+from experiments.scenarios.laser_outlines import outlines as outlines_of
 from experiments.scenarios.moving_objects import World, in_view, see, truth_of
 from experiments.scenarios.paths import wrap
 from experiments.scenarios.scene import Scene
@@ -94,6 +95,7 @@ def urban_sensors(
     bad_weather: bool = False,
     latency: float = 0.0,
     raw_laser: bool = False,
+    outlines: bool = False,
 ) -> Scene:
     """Scans of the sensors in order of arrival; the truth is that of the road users in view of one of them.
 
@@ -105,6 +107,7 @@ def urban_sensors(
     bad_weather  the camera detects .36 of what it sees, not .85
     latency      of the camera's scans [s]: they arrive so much after they were taken, other sensors' at once
     raw_laser    simulate the laser's beams on rectangles that hide each other, and send the middles of fitted boxes
+    outlines     simulate them, and send what they show of each rectangle (models.objects.outline)
 
     Raises InputError for numbers out of range and names that are not known."""
     _check(seed, number, duration, kinds, sensors, dropout, dropout_from, dropout_to, latency)
@@ -120,8 +123,8 @@ def urban_sensors(
         rng = np.random.default_rng(own_seed)
         for tick in clocks.get(sensor.name, ()):
             t, when = int(np.searchsorted(ticks, tick)), tick * STEP
-            if sensor.name == "laser" and raw_laser:
-                scan = beams(sensor, world, t, rng)
+            if sensor.name == "laser" and (raw_laser or outlines):
+                scan = beams(sensor, world, t, rng, outlines)
             else:
                 scan, _ = see(model, sensor.name, world, t, pose, rng)
             if sensor.name != dropout or not dropout_from <= when < dropout_to:
@@ -131,7 +134,8 @@ def urban_sensors(
     told = in_view(own, model.motion, world, np.zeros((len(ticks), 3)))
     info = {"scenario": "urban_sensors", "seed": seed, "number": number, "duration_s": duration}
     info |= {"kinds": ", ".join(kinds), "sensors": ", ".join(sensors), "dropout": dropout or "none"}
-    info |= {"bad_weather": bad_weather, "latency_s": latency, "raw_laser": raw_laser, "scans": len(scans)}
+    info |= {"bad_weather": bad_weather, "latency_s": latency, "raw_laser": raw_laser, "outlines": outlines}
+    info |= {"scans": len(scans)}
     info |= {f"{kind}s": int((world.kind == k).sum()) for k, kind in enumerate(kinds)}
     data = Recording(tuple(scans[i] for i in order))
     return Scene(data, truth_of(world, model.motion, told), f"urban_sensors {seed}", info)
@@ -210,10 +214,10 @@ def suite(kinds: tuple[str, ...], sensors: tuple[str, ...]) -> tuple[Sensor, ...
     return tuple(replace(s, confusion=table) if s.name == "camera" else s for s in SUITE if s.name in sensors)
 
 
-def beams(sensor: Sensor, world: World, t: int, rng: np.random.Generator) -> Scan:
-    """A scan of the middles of boxes, fitted to the points where beams end."""
+def beams(sensor: Sensor, world: World, t: int, rng: np.random.Generator, outlines: bool) -> Scan:
+    """A scan of the middles of boxes, fitted to the points where beams end, or of outlines."""
     there = world.present(t)
     rectangles = np.concatenate([world.state[t, there, :3], world.size[there]], -1)
     points = sweep(LASER, np.array(sensor.mount), sensor.angle, sensor.reach[1], rectangles, rng)
-    found = boxes(points, LASER)
+    found = outlines_of(points, LASER) if outlines else boxes(points, LASER)
     return Scan(sensor.name, float(world.time[t]), found.values, np.zeros(3), noise=found.noise)

@@ -31,7 +31,8 @@ AROUND = 3.141  # half an angle of view from which on a sensor sees all around [
 
 class Placed(NamedTuple):
     """Where M measurements say that something is: position (M, 2) and its covariance (M, 2, 2) in the world, and the
-    headings (M, H) that it may have with their standard deviation (M,), None where any is possible."""
+    headings (M, H) that it may have, None where any is possible, with their standard deviation (M,), None where
+    they are told apart from each other only: then they share the circle."""
 
     position: Floats
     covariance: Floats

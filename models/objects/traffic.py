@@ -320,10 +320,11 @@ class Traffic:
         number = (
             self.density(placed.position) * 2 * math.pi * np.sqrt(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] ** 2)
         )
-        if placed.heading is None or placed.heading_std is None:
+        if placed.heading is None:
             return self._newcomers(number, placed.position, flat)
-        wide = FLAT * placed.heading_std  # the same for the density 1 / (2 pi) of each heading
-        number = number * placed.heading.shape[1] * wide / math.sqrt(2 * math.pi)
+        shared = math.sqrt(2 * math.pi) / placed.heading.shape[1]  # the width at which their weights sum to one
+        wide = np.full(num, shared) if placed.heading_std is None else FLAT * placed.heading_std
+        number = number * wide / shared  # the same for the density 1 / (2 pi) of each heading
         return self._newcomers(number, placed.position, flat, placed.heading, wide)
 
     def arrivals(self, seconds: float) -> Bernoullis:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from inference.progress import Progress
+from inference.refusal import accept, answers_first
 from inference.tracks import Objects, Tracks
 from models.objects.motion import ConstantVelocity
 from models.objects.scans import Scan
@@ -48,6 +49,7 @@ class Parts(NamedTuple):
     drift: float  # [m/s]
 
 
+@answers_first
 def run(
     model: Traffic,
     scans: Sequence[Scan | ScanFrame],
@@ -90,6 +92,7 @@ def run(
         step = density_filter(model, parts, gate, prune, merge)
     else:
         step = target_filter(parts, tracker == "jpda", gate, hits, held, misses, near)
+    accept()
     return _tracks(model, found, step, progress, tracker)
 
 

@@ -36,6 +36,7 @@ from inference.joint_particles_kernel import associations, weigh
 from inference.lmb import STRIDE
 from inference.lmb_particles import check_particles, components_of, meet, moved_on, side_by_side
 from inference.object_particles import LEAST_MISS, draw_prior, moments, widen
+from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed
@@ -185,6 +186,7 @@ def tell(belief: Belief, report: float, period: Floats, num_kinds: int) -> Objec
     return Objects(label[rows], np.minimum(existence[rows], 1.0), mean[rows], covariance[rows], share)
 
 
+@answers_first
 def run(
     model: HasObjects,
     scans: Sequence[Any],

@@ -33,6 +33,7 @@ from inference.lmb import LONGEST, STRIDE
 from inference.lmb_kernel import survive
 from inference.lmb_particles_kernel import update
 from inference.object_particles import draw, draw_prior, log_corrections, moments, widen
+from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, View
@@ -260,6 +261,7 @@ def tell(belief: Belief, report: float, period: Floats, num_kinds: int) -> Objec
     return Objects(told.label, told.existence, mean, covariance, share)
 
 
+@answers_first
 def run(
     model: HasObjects,
     scans: Sequence[Any],

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from inference import lmb
 from inference.association import MISSED, Table, best
 from inference.lmb_kernel import heaviest
+from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, no_objects
@@ -213,6 +214,7 @@ def tell(belief: Belief, num_kinds: int) -> Objects:
     return Objects(belief.objects.label[rows], np.ones(len(rows)), mean[rows], covariance[rows], kind[rows])
 
 
+@answers_first
 def run(
     model: HasObjects,
     scans: Sequence[Any],

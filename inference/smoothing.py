@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from inference.lmb import LONGEST, Knobs
 from inference.lmb_association import associate
 from inference.lmb_kernel import propagate
+from inference.refusal import answers_first
 from inference.track_kernel import see
 from inference.track_weight import Track, Window, follow, picked, window_of
 from inference.tracking import require_objects
@@ -171,6 +172,7 @@ def apart(a: Floats, b: Floats, period: Floats) -> Floats:
     return np.where(finite, gap - turn * np.floor(gap / turn + 0.5), gap)
 
 
+@answers_first
 def run(
     model: HasObjects,
     scans: Sequence[Any],

@@ -203,7 +203,7 @@ def test_showing_less_makes_no_false_alarm_of_an_object() -> None:
 
 
 def test_outlines_beat_the_middles_of_boxes_on_the_same_scans() -> None:
-    """Root mean square position error in a city, by the same beams: less than half of it, and squares nearer to 2."""
+    """Root mean square position error in a city, by the same beams: less than half of it."""
     found = dict[str, dict[str, float]]()
     for name, option in (("traffic_urban", {"raw_laser": True}), ("traffic_extended", {"outlines": True})):
         with initialize_config_module("configs", version_base="1.3"):

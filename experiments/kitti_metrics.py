@@ -12,7 +12,7 @@ from experiments.kitti_existence import Candidates, candidates, fit_all, report
 from experiments.scenarios.junction import DATA_ROOT
 from experiments.scenarios.kitti_scans import CAMERA, KittiTruth, kitti_scans
 from experiments.scenarios.kitti_tracking import sequences
-from experiments.scenarios.scene import Scene
+from experiments.scenarios.scene import Scene, TrafficTruth
 from inference.posterior import Posterior
 from inference.tracks import Tracks
 from models.objects.traffic import Traffic
@@ -48,6 +48,35 @@ def metrics(
     scores = evaluate([scene_of(scene.truth)], [boxes], average=False)
     ms = 1e3 * float(np.median(frame_seconds(posterior)))
     return {f"kitti_{name}": scores[name] for name in KEPT} | {"kitti_ms_per_frame": ms}
+
+
+def figures(posterior: Posterior, scene: Scene, *, traffic: Traffic, view: float | None = None) -> dict[str, Any]:
+    """experiments.view_metrics.figures, with the paths of the labelled cars and vans; `view` is the side of the moving
+    picture [m]."""
+    from experiments import view_metrics
+
+    if not isinstance(scene.truth, KittiTruth):
+        return {}
+    return view_metrics.figures(posterior, scene._replace(truth=paths_of(scene.truth)), traffic=traffic, view=view)
+
+
+def paths_of(truth: KittiTruth) -> TrafficTruth:
+    """Where the labelled cars and vans were; their velocities are unknown."""
+    labels, cars = truth.labels, np.isin(truth.labels.kind, ["Car", "Van"])
+    unknown = np.full(int(cars.sum()), np.nan)
+    return TrafficTruth(
+        time=truth.sequence.time,
+        offset=np.concatenate([[0], np.cumsum(cars)])[labels.offset],
+        label=labels.track[cars],
+        x=labels.position[cars, 0],
+        y=labels.position[cars, 1],
+        vx=unknown,
+        vy=unknown,
+        heading=labels.heading[cars],
+        length=labels.size[cars, 2],
+        width=labels.size[cars, 1],
+        kind=np.zeros(len(unknown), dtype=np.int64),
+    )
 
 
 def scene_of(truth: KittiTruth) -> Scene:

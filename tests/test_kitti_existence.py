@@ -22,6 +22,7 @@ from experiments.kitti_existence import (
     report,
 )
 from experiments.kitti_matching import TrackBoxes
+from experiments.kitti_metrics import paths_of
 from experiments.scenarios.kitti_scans import CAMERA, LASER, KittiTruth, scans_of
 from experiments.scenarios.kitti_tracking import CameraBoxes, Detections
 from inference.tracks import Tracks
@@ -197,3 +198,15 @@ def test_scans_are_what_the_sensors_measure_of_a_box() -> None:
     np.testing.assert_allclose(std[1] * [1, laser.values[1, 0], 1, 1, 1, 1, 1], [0.12, 0.07, 0.05, 0.08, 0.1, 0.1, 0.3])
     np.testing.assert_allclose(std[0, 2:] / std[1, 2:], np.exp(0.15 * 5.0))
     assert (np.diagonal(camera.noise, 0, 1, 2)[1] == 1.0).tolist() == [False, True, False]  # cut off at the right
+
+
+def test_pictures_show_the_paths_of_cars_and_vans_only() -> None:
+    truth, _ = made_up(0)
+    labels = truth.labels
+    kind = labels.kind.copy()
+    kind[0] = "Pedestrian"
+    paths = paths_of(truth._replace(labels=labels._replace(kind=kind)))
+    np.testing.assert_array_equal(paths.label, labels.track[1:])
+    np.testing.assert_array_equal(paths.position, labels.position[1:, :2])
+    assert paths.offset.tolist() == np.maximum(labels.offset - 1, 0).tolist()
+    np.testing.assert_array_equal(paths.time, truth.sequence.time)

@@ -190,7 +190,7 @@ def see(model: Traffic, state: State, frame: ScanFrame) -> None:
 
 def _moved(model: Traffic, state: State, dt: float) -> Tensor:
     """f(x, dt) + L e, (*B, S, n)."""
-    x, own = state["state"], torch.from_numpy(model.step_settings)[state["kind"]]  # (*B, S, .)
+    x, own = state["state"], torch.from_numpy(model.noises)[state["kind"]]  # (*B, S, .)
     settings = torch.cat([torch.full((*own.shape[:-1], 1), dt), own], -1)
     L = noise_formula(model.motion).torch(x, settings)
     L = L.unflatten(-1, (len(model.names), -1))

@@ -53,8 +53,6 @@ class Kind:
     speed         mean and standard deviation [m/s] when first seen
     yaw_rate_std, acceleration_std  when first seen [rad/s], [m/s^2]
     extras        (mean, standard deviation) of the motion's extras when first seen
-    rates         at which extras go back to their mean [1/s]: with noise q and rate r their standard deviation tends to
-                  q / sqrt(2 r); none for random walks
     visibility    factor to every sensor's probability to detect it
     radius        of the disc that hides what is behind it [m]
     """
@@ -67,13 +65,11 @@ class Kind:
     yaw_rate_std: float = 0.2
     acceleration_std: float = 0.5
     extras: tuple[tuple[float, float], ...] = ()
-    rates: tuple[float, ...] = ()
     visibility: float = 1.0
     radius: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "extras", tuple(tuple(pair) for pair in self.extras))  # configs have lists
-        object.__setattr__(self, "rates", tuple(self.rates) or (0.0,) * len(self.extras))
         for what in ("share", "lifetime", "radius"):
             if not 0.0 < getattr(self, what) < math.inf:
                 raise InputError(f"kind {self.name}: {what} is {getattr(self, what)}; give a positive number")
@@ -145,10 +141,9 @@ class Traffic:
         return {sensor.name: sensor for sensor in self.sensors}
 
     @cached_property
-    def step_settings(self) -> Floats:
-        """(C, .) what a step depends on but its time, of each kind: noises, rates and levels of the extras."""
-        levels = [[mean for mean, _ in kind.extras] for kind in self.kinds]
-        return np.array([(*k.noise, *k.rates, *m) for k, m in zip(self.kinds, levels, strict=True)])
+    def noises(self) -> Floats:
+        """(C, .) standard deviations by the motion's `noises`, of each kind."""
+        return np.array([kind.noise for kind in self.kinds])
 
     @cached_property
     def visibility(self) -> Floats:
@@ -265,8 +260,8 @@ class Traffic:
         size, num = len(self.names), len(kind)
         moved, slope = np.empty((num, size)), np.empty((num, size, size))
         noise = np.empty((num, noise_formula(self.motion).num_y))
-        settings = np.empty((num, 1 + self.step_settings.shape[1]))
-        settings[:, 0], settings[:, 1:] = seconds, self.step_settings[kind]
+        settings = np.empty((num, 1 + self.noises.shape[1]))
+        settings[:, 0], settings[:, 1:] = seconds, self.noises[kind]
         move_formula(self.motion).compiled()(mean, settings, moved, slope)
         noise_formula(self.motion).compiled(jacobian=False)(mean, settings, noise)
         return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self._lifetime[kind]))

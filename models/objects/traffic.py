@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.formula import Formula
-from models.multi_object import Bernoullis, Components, Moved, View, no_components, no_objects
+from models.multi_object import Bernoullis, Components, Moved, View, joined, no_components, no_objects
 from models.objects.ground import Ground, limited
 from models.objects.motion import ANGLES, ConstantTurn, Motion, move_formula, noise_formula
 from models.objects.newcomers import lay_out
-from models.objects.perception import together
+from models.objects.perception import hidden_by_any
 from models.objects.scans import Recording, Scan, check_scan
 from models.objects.scene import ScanFrame, State, first, frames_of, in_order, see, step
 from models.objects.sensors import Sensor, hidden_formula, mounted, sensor_formulas
@@ -300,7 +300,7 @@ class Traffic:
         p[..., :3], p[..., 3], p[..., 4] = at, self._radius[kind][:, None], self._radius[parts.kind[best]]
         share = hidden_formula()(x.reshape(-1, 4), p.reshape(-1, 5)).reshape(x.shape[:2])
         share[np.arange(len(parts.mean)), parts.group] = 0.0  # nobody hides itself
-        return np.asarray(sensor.occlusion * together(share, objects.existence))
+        return np.asarray(sensor.occlusion * hidden_by_any(share, objects.existence))
 
     def unseen(self, scan: Scan) -> Components:
         sensor, size, num = self.sensor(scan), len(self.names), len(scan.values)
@@ -332,7 +332,7 @@ class Traffic:
         for i, place in enumerate(self.places):
             known = () if place.heading is None else (np.array([[place.heading[0]]]), np.array([place.heading[1]]))
             groups.append(self._newcomers(np.ones(1), position[i : i + 1], covariance[i : i + 1], *known))
-        return Bernoullis(np.zeros(len(self.places), dtype=np.int64), existence, _joined(groups))
+        return Bernoullis(np.zeros(len(self.places), dtype=np.int64), existence, joined(*groups))
 
     def _newcomers(
         self,
@@ -374,9 +374,3 @@ def _state_prior(motion: Motion, kind: Kind) -> tuple[Floats, Floats]:
     known |= dict.fromkeys(("x", "y", "heading"), (0.0, 0.0))
     loc, std = zip(*(known[name] for name in motion.names), strict=True)
     return np.array(loc), np.array(std)
-
-
-def _joined(groups: Sequence[Components]) -> Components:
-    offset = np.cumsum([0, *(len(group.weight) for group in groups)])
-    parts = (np.concatenate([group[i] for group in groups]) for i in range(1, 5))
-    return Components(offset, *parts)

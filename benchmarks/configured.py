@@ -9,16 +9,22 @@ from typing import Any
 from inference.posterior import Posterior
 
 
-@lru_cache
-def configured(group: str, name: str) -> Any:
-    """What the config GROUP=NAME makes: a model, or an engine that waits for its arguments."""
+def made(words: list[str], *groups: str) -> tuple[Any, ...]:
+    """What these groups of the config make that the words compose: models, engines that wait for their arguments."""
     from hydra import compose, initialize_config_module
     from omegaconf import OmegaConf
 
     from experiments.schema import build
 
     with initialize_config_module("configs", version_base="1.3"):
-        return build(OmegaConf.to_container(compose("run", [f"{group}={name}"])[group], resolve=True), group)
+        config = compose("run", words)
+    return tuple(build(OmegaConf.to_container(config[group], resolve=True), group) for group in groups)
+
+
+@lru_cache
+def configured(group: str, name: str) -> Any:
+    """What the config GROUP=NAME makes: a model, or an engine that waits for its arguments."""
+    return made([f"{group}={name}"], group)[0]
 
 
 def quiet_engine(name: str, **knobs: Any) -> Callable[..., Posterior]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.configured import made
 from benchmarks.figure import Figure, Measurement, Value, Values, share
 from benchmarks.junction import Effort
 from benchmarks.junction_structure import DATA
@@ -32,12 +33,7 @@ ABSENT = "the data folder is absent"
 @lru_cache
 def configured() -> tuple[Any, Callable[..., TrafficPosterior]]:
     """The model and the engine of experiment=lankershim_lanes."""
-    from hydra import compose, initialize_config_module
-    from hydra.utils import instantiate
-
-    with initialize_config_module("configs", version_base="1.3"):
-        config = compose("run", ["experiment=lankershim_lanes"])
-    return instantiate(config.model), instantiate(config.engine)
+    return made(["experiment=lankershim_lanes"], "model", "engine")  # type: ignore[return-value]
 
 
 def lanes(scene: Scene) -> TrafficPosterior:

@@ -10,24 +10,12 @@ model, the features and the two thresholds of reporting were chosen by the poole
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from benchmarks import command
+from benchmarks.configured import made
 from benchmarks.figure import Figure, Measurement, Value, Values
 from benchmarks.kitti_baseline import DATA, PUBLIC, Effort
 from models.program import InputError
-
-
-def configured(experiment: str) -> tuple[Any, Any]:
-    """Model and engine of an experiment, as its config has them."""
-    from hydra import compose, initialize_config_module
-    from omegaconf import OmegaConf
-
-    from experiments.schema import build
-
-    with initialize_config_module("configs", version_base="1.3"):
-        config = compose("run", [f"experiment={experiment}", "engine.progress=false"])
-    return tuple(build(OmegaConf.to_container(config[part], resolve=True)) for part in ("model", "engine"))  # type: ignore[return-value]
 
 
 def follow(effort: Effort, camera: bool) -> dict[str, Value]:
@@ -40,7 +28,8 @@ def follow(effort: Effort, camera: bool) -> dict[str, Value]:
     from experiments.scenarios.kitti_tracking import sequences
     from inference.progress import Progress
 
-    model, engine = configured("kitti_tracking_camera" if camera else "kitti_tracking")
+    experiment = "kitti_tracking_camera" if camera else "kitti_tracking"
+    model, engine = made([f"experiment={experiment}", "engine.progress=false"], "model", "engine")
     names = sequences(DATA)[: effort.scenes]
     followed(model, engine, names[0], camera=camera, data_root=DATA)  # machine code is made here, unmeasured
     truths, found, seconds = [], [], []

@@ -34,12 +34,12 @@ from numpy.typing import NDArray
 from inference import weights
 from inference.joint_particles_kernel import associations, weigh
 from inference.lmb import STRIDE
-from inference.lmb_particles import check_particles, components_of, meet, moved_on, side_by_side
+from inference.lmb_particles import check_particles, components_of, meet, moved_on
 from inference.object_particles import LEAST_MISS, draw_prior, moments, widen
 from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
-from models.multi_object import Bernoullis, Components, HasObjects, Timed
+from models.multi_object import Bernoullis, Components, HasObjects, Timed, joined
 from models.program import InputError
 
 Floats = NDArray[np.float64]
@@ -65,7 +65,7 @@ class Knobs(NamedTuple):
     max_shared: int = 8
 
 
-class Belief(NamedTuple):
+class Scenes(NamedTuple):
     """N particles at a time [s], None before the first scan, with R objects in all.
 
     log_weight  (N,) log W, summing to one
@@ -91,8 +91,8 @@ class Belief(NamedTuple):
 
 
 def predict(
-    model: HasObjects, belief: Belief, seconds: float, number: int, rng: np.random.Generator
-) -> tuple[Belief, Floats, Floats]:
+    model: HasObjects, belief: Scenes, seconds: float, number: int, rng: np.random.Generator
+) -> tuple[Scenes, Floats, Floats]:
     """The objects `seconds` later, with those that arrived at known places, drawn particle by particle; survival (R,)
     and the covariance (R, n, n) of the motion's noise."""
     state, survival, covariance = moved_on(model, belief.kind, belief.state, seconds, rng)
@@ -110,13 +110,13 @@ def predict(
         draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size))),
         component - parts.offset[which],
     )
-    joined = (np.concatenate(pair) for pair in zip(belief[2:], fresh, strict=True))
-    belief = Belief(belief.time, belief.log_weight, *joined)
+    both = (np.concatenate(pair) for pair in zip(belief[2:], fresh, strict=True))
+    belief = Scenes(belief.time, belief.log_weight, *both)
     none = np.zeros((len(component), size, size))
     return belief, np.concatenate([survival, np.ones(len(component))]), np.concatenate([covariance, none])
 
 
-def by_label(belief: Belief, covariance: Floats, period: Floats, kernel: float) -> Bernoullis:
+def by_label(belief: Scenes, covariance: Floats, period: Floats, kernel: float) -> Bernoullis:
     """The objects as components, by labels, each with its kernel about it and `covariance` more."""
     label, first, group = np.unique(belief.label, return_index=True, return_inverse=True)
     weight, state = belief.weight, belief.state.copy()
@@ -132,8 +132,8 @@ def by_label(belief: Belief, covariance: Floats, period: Floats, kernel: float) 
 
 
 def step(
-    model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Knobs, seed: int
-) -> tuple[Belief, Facts, float]:
+    model: HasObjects, belief: Scenes, scan: Timed, number: int, knobs: Knobs, seed: int
+) -> tuple[Scenes, Facts, float]:
     """Predict to the scan, and update by it; and what the particles were worth. `number` of the scan, for labels and
     random numbers. The scan must not be older than the belief."""
     rng, num = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))), knobs.num_particles
@@ -160,7 +160,7 @@ def step(
     there, detection = survival[old], view.detection[old]
     stays = there * np.maximum(1.0 - detection, LEAST_MISS) / np.maximum(1.0 - there * detection, LEAST_MISS)
     kept = (made >= 0) | (rng.random(len(old)) < stays)
-    parts = side_by_side(objects.components, unseen)
+    parts = joined(objects.components, unseen)
     component = np.concatenate([old[kept], rows + new_part])
     particle, measured = np.concatenate([whose[kept], new_whose]), np.concatenate([made[kept], new_made])
     state, log_corrections = meet(model, scan, objects, parts, view, component, measured, rng)
@@ -170,11 +170,11 @@ def step(
     family = np.concatenate([belief.family[old[kept]], new_part - unseen.offset[new_made]])
     by = np.lexsort((particle, label))
     kind = parts.kind[component]
-    posterior = Belief(scan.time, log_weight - log_more, label[by], particle[by], kind[by], state[by], family[by])
+    posterior = Scenes(scan.time, log_weight - log_more, label[by], particle[by], kind[by], state[by], family[by])
     return posterior, Facts(log_factor + log_more, int(loopy > 0)), worth
 
 
-def tell(belief: Belief, report: float, period: Floats, num_kinds: int) -> Objects:
+def tell(belief: Scenes, report: float, period: Floats, num_kinds: int) -> Objects:
     """The objects more probable than `report`, by the moments of their particles; angles are circular."""
     label, group = np.unique(belief.label, return_inverse=True)
     num, weight = len(label), belief.weight
@@ -219,7 +219,7 @@ def run(
     knobs, size = Knobs(num_particles, ess, kernel, gate, max_shared), len(model.names)
     worth, none = list[float](), np.zeros(0, dtype=np.int64)
 
-    def advance(belief: Belief, scan: Any, number: int) -> tuple[Belief, Facts]:
+    def advance(belief: Scenes, scan: Any, number: int) -> tuple[Scenes, Facts]:
         belief, facts, ess = step(model, belief, scan, number, knobs, seed)
         worth.append(ess)
         return belief, facts
@@ -228,7 +228,7 @@ def run(
     tracks = track(
         model,
         scans,
-        Belief(None, even, none, none, none, np.zeros((0, size)), none),
+        Scenes(None, even, none, none, none, np.zeros((0, size)), none),
         advance,
         lambda belief: tell(belief, report, model.period, len(model.kind_names)),
         patience=patience,

@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
 from inference.association_kernel import AUTO, MISSED, associate, choose
 from inference.association_random import uniform
-from inference.lmb_kernel import (
-    LOG_TAU,
-    MAX_ITERATIONS,
-    TOLERANCE,
-    cholesky,
-    longer,
-    project,
-    unseen_mass,
-    whiten,
-    wrapped,
-)
+from inference.lmb_kernel import MAX_ITERATIONS, TOLERANCE, densities, longer, room_for, unseen_mass
 from inference.object_particles import LEAST_MISS
 
 
@@ -42,7 +30,7 @@ def weigh(  # type: ignore[no-untyped-def]
         predicted, slope, detection, values, noise, sort, feature, period,
     )  # fmt: skip
     intensity = np.maximum(clutter + rho, 1e-100)
-    G, base, C, residual, y = np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d), np.empty(d)
+    room, density, every = room_for(n, d), np.empty(M), np.arange(M)
     offset, missed, entries, loopy = np.zeros(rows + 1, np.int64), np.empty(rows), 0, 0
     measurement, ratio = np.empty(2 * rows + 16, np.int64), np.empty(2 * rows + 16)
     log_seen = np.full(num, np.log(intensity).sum())
@@ -51,21 +39,14 @@ def weigh(  # type: ignore[no-untyped-def]
         alive = survival[c] * detection[c]
         missed[k] = max(1.0 - alive, LEAST_MISS)
         if alive > 1e-9:
-            project(P[c], slope[c], G, base)
-            solved, log_norm = -1, 0.0
+            densities(P[c], slope[c], predicted[c], values, every, noise, sort, period, gate, room, density)
             for j in range(M):
-                if solved != sort[j]:
-                    solved = sort[j]
-                    log_norm = -cholesky(base + noise[solved], C) - 0.5 * d * LOG_TAU
-                for a in range(d):
-                    residual[a] = wrapped(values[j, a] - predicted[c, a], period[a])
-                square = whiten(C, residual, y)
-                if square > gate:
+                if density[j] == 0.0:
                     continue
                 if entries == len(ratio):
                     measurement, ratio = longer(measurement), longer(ratio)
                 measurement[entries] = j
-                ratio[entries] = alive * feature[j, kind[c]] * math.exp(log_norm - 0.5 * square) / intensity[j]
+                ratio[entries] = alive * feature[j, kind[c]] * density[j] / intensity[j]
                 entries += 1
         offset[k + 1] = entries
     taken, free, random = np.empty(entries), np.empty(rows), np.zeros(1, np.uint64)

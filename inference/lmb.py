@@ -32,7 +32,7 @@ from inference.lmb_kernel import heaviest, propagate, update
 from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
-from models.multi_object import Bernoullis, Components, HasObjects, Ints, Timed, no_objects
+from models.multi_object import Bernoullis, Components, HasObjects, Ints, Timed, no_objects, together
 from models.program import InputError
 
 STRIDE = 1 << 20  # labels: number of the scan times this, plus the measurement
@@ -105,14 +105,6 @@ def predict(model: HasObjects, belief: Belief, seconds: float, number: int) -> B
         label = number * STRIDE + STRIDE // 2 + np.arange(len(arrived.label))
         objects = together(objects, arrived._replace(label=label))
     return objects
-
-
-def together(a: Bernoullis, b: Bernoullis) -> Bernoullis:
-    """All of both."""
-    offset = np.concatenate([a.components.offset, a.components.offset[-1] + b.components.offset[1:]])
-    rest = (np.concatenate(pair) for pair in zip(a.components[1:], b.components[1:], strict=True))
-    label, existence = np.concatenate([a.label, b.label]), np.concatenate([a.existence, b.existence])
-    return Bernoullis(label, existence, Components(offset, *rest))
 
 
 def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Knobs) -> tuple[Belief, Facts]:

@@ -213,23 +213,54 @@ def longer(array):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
+def room_for(n, d):  # type: ignore[no-untyped-def]
+    """What `innovation` and `densities` write into, of states (n,) and measurements (d,): G, S, C, residual and y."""
+    return np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d), np.empty(d)
+
+
+@njit(error_model="numpy")
+def innovation(P, H, h, z, R, period, room):  # type: ignore[no-untyped-def]
+    """|y|^2 and log det C, where C C' = S = H P H' + R and y = C^-1 (z - h); G = P H', S, C and y are left in the room,
+    so that N(z; h, S) = exp(-log det C - (|y|^2 + d log 2 pi) / 2)."""
+    G, S, C, residual, y = room
+    project(P, H, G, S)
+    S += R
+    log_det = cholesky(S, C)
+    for a in range(len(period)):
+        residual[a] = wrapped(z[a] - h[a], period[a])
+    return whiten(C, residual, y), log_det
+
+
+@njit(error_model="numpy")
+def densities(P, H, h, values, near, noise, sort, period, gate, room, found):  # type: ignore[no-untyped-def]
+    """found[e] = N(z_j; h, H P H' + R_j) of the measurements j = near[e]; none where the squared Mahalanobis distance
+    is beyond the gate."""
+    G, S, C, residual, y = room
+    d, base, solved, log_norm = len(period), np.empty_like(S), -1, 0.0
+    project(P, H, G, base)
+    for e in range(len(near)):
+        j = near[e]
+        if solved != sort[j]:
+            solved = sort[j]
+            np.add(base, noise[solved], S)
+            log_norm = -cholesky(S, C) - 0.5 * d * LOG_TAU
+        for a in range(d):
+            residual[a] = wrapped(values[j, a] - h[a], period[a])
+        square = whiten(C, residual, y)
+        found[e] = 0.0 if square > gate else math.exp(log_norm - 0.5 * square)
+
+
+@njit(error_model="numpy")
 def unseen_mass(offset, weight, kind, P, first, predicted, slope, detection, values, noise, sort, feature, period):  # type: ignore[no-untyped-def]
     """What unseen objects make of each measurement, component by component:
 
     mass_u = weight_u p_D N(z_j; h, H P H' + R) feature_j(kind),   rho_j = sum_u mass_u"""
     d, n = slope.shape[1], slope.shape[2]
-    G, S, C = np.empty((n, d)), np.empty((d, d)), np.empty((d, d))
-    residual, y = np.empty(d), np.empty(d)
-    mass, rho = np.zeros(len(weight)), np.zeros(len(values))
+    mass, rho, room = np.zeros(len(weight)), np.zeros(len(values)), room_for(n, d)
     for j in range(len(values)):
         for u in range(offset[j], offset[j + 1]):
             i = first + u
-            project(P[u], slope[i], G, S)
-            S += noise[sort[j]]
-            log_det = cholesky(S, C)
-            for a in range(d):
-                residual[a] = wrapped(values[j, a] - predicted[i, a], period[a])
-            square = whiten(C, residual, y)
+            square, log_det = innovation(P[u], slope[i], predicted[i], values[j], noise[sort[j]], period, room)
             mass[u] = weight[u] * detection[i] * feature[j, kind[u]] * math.exp(-log_det - 0.5 * (square + d * LOG_TAU))
             rho[j] += mass[u]
     return mass, rho
@@ -250,24 +281,12 @@ def update(  # type: ignore[no-untyped-def]
     num, count, n, d, M = len(existence), len(weight), mean.shape[1], slope.shape[1], len(values)
     num_kinds = feature.shape[1]
     mass, rho = unseen_mass(
-        new_offset,
-        new_weight,
-        new_kind,
-        new_P,
-        count,
-        predicted,
-        slope,
-        detection,
-        values,
-        noise,
-        sort,
-        feature,
-        period,
-    )
-    intensity = np.maximum(clutter + rho, 1e-100)  # of measurements that no old object made
-    G, base, S, C, residual, y = (
-        np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d), np.empty(d)
+        new_offset, new_weight, new_kind, new_P, count,
+        predicted, slope, detection, values, noise, sort, feature, period,
     )  # fmt: skip
+    intensity = np.maximum(clutter + rho, 1e-100)  # of measurements that no old object made
+    parts, base = room_for(n, d), np.empty((d, d))
+    G, S, C, residual, y = parts
     # pairs of a component and a measurement within its gate; those of one component and one R share their gain
     room = 2 * count + 16
     pair_component, pair_gain, pair_entry = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64)
@@ -401,12 +420,7 @@ def update(  # type: ignore[no-untyped-def]
             if mass[u] < SMALL * rho[j]:
                 continue
             i = count + u
-            project(new_P[u], slope[i], G, S)
-            S += noise[sort[j]]
-            cholesky(S, C)
-            for a in range(d):
-                residual[a] = wrapped(values[j, a] - predicted[i, a], period[a])
-            whiten(C, residual, y)
+            innovation(new_P[u], slope[i], predicted[i], values[j], noise[sort[j]], period, parts)
             gain(C, G, W)
             w[have], k[have] = mass[u] / rho[j], new_kind[u]
             condition(new_mean[u], new_P[u], W, y, m[have], V[have])

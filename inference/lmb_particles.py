@@ -36,7 +36,7 @@ from inference.object_particles import draw, draw_prior, log_corrections, moment
 from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
-from models.multi_object import Bernoullis, Components, HasObjects, Timed, View
+from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, joined
 from models.program import InputError
 
 Floats = NDArray[np.float64]
@@ -61,7 +61,7 @@ class Knobs(NamedTuple):
     max_shared: int = 8
 
 
-class Belief(NamedTuple):
+class Clouds(NamedTuple):
     """T objects of N particles each at a time [s], None before the first scan.
 
     label (T,), existence (T,), weight (T, N) summing to one by object, kind (T, N), state (T, N, n), and family (T, N):
@@ -89,26 +89,21 @@ class Belief(NamedTuple):
         )
         return Bernoullis(self.label, self.existence, parts)
 
-    def only(self, rows: Any) -> Belief:
+    def only(self, rows: Any) -> Clouds:
         """Some of the objects."""
-        return Belief(self.time, *(value[rows] for value in self[1:]))
+        return Clouds(self.time, *(value[rows] for value in self[1:]))
 
 
-def nobody(size: int, num_particles: int) -> Belief:
+def nobody(size: int, num_particles: int) -> Clouds:
     """No objects, at no time."""
     none = np.zeros((0, num_particles))
     label, index = np.zeros(0, dtype=np.int64), none.astype(np.int64)
-    return Belief(None, label, np.zeros(0), none, index, np.zeros((0, num_particles, size)), index)
-
-
-def together(a: Belief, b: Belief) -> Belief:
-    """The objects of both, at the time of the first."""
-    return Belief(a.time, *(np.concatenate(pair) for pair in zip(a[1:], b[1:], strict=True)))
+    return Clouds(None, label, np.zeros(0), none, index, np.zeros((0, num_particles, size)), index)
 
 
 def predict(
-    model: HasObjects, belief: Belief, seconds: float, number: int, rng: np.random.Generator
-) -> tuple[Belief, Floats]:
+    model: HasObjects, belief: Clouds, seconds: float, number: int, rng: np.random.Generator
+) -> tuple[Clouds, Floats]:
     """The objects `seconds` later, with those that arrived at known places, labelled by the scan's `number`, and the
     covariance (T N, n, n) of the motion's noise about them."""
     size, num = belief.state.shape[2], belief.weight.shape[1]
@@ -125,11 +120,17 @@ def predict(
     label, parts = number * STRIDE + STRIDE // 2 + np.arange(len(arrived.label)), arrived.components
     component = components_of(parts.offset, parts.weight, range(len(label)), num, rng)
     state = draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size)))
-    even = np.full((len(label), num), 1.0 / num)
-    kind, state = parts.kind[component].reshape(-1, num), state.reshape(-1, num, size)
-    family = component.reshape(-1, num) - parts.offset[:-1, None]
+    fresh = (
+        label,
+        arrived.existence,
+        np.full((len(label), num), 1.0 / num),
+        parts.kind[component].reshape(-1, num),
+        state.reshape(-1, num, size),
+        component.reshape(-1, num) - parts.offset[:-1, None],
+    )
+    both = (np.concatenate(pair) for pair in zip(belief[1:], fresh, strict=True))
     covariance = np.concatenate([covariance, np.zeros((len(component), size, size))])
-    return together(belief, Belief(belief.time, label, arrived.existence, even, kind, state, family)), covariance
+    return Clouds(belief.time, *both), covariance
 
 
 def moved_on(
@@ -158,7 +159,7 @@ def components_of(offset: Ints, weight: Floats, groups: Any, num: int, rng: np.r
     return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
 
-def regularise(belief: Belief, covariance: Floats, period: Floats, kernel: float) -> Bernoullis:
+def regularise(belief: Clouds, covariance: Floats, period: Floats, kernel: float) -> Bernoullis:
     """The particles as components, each the kernel of its family about it and `covariance` (T N, n, n) more."""
     num, size = len(belief.label), belief.state.shape[2]
     if num and kernel > 0.0:
@@ -195,12 +196,6 @@ def meet(
     return state, log_corrections(state, seen, detected, component, measurement, *about, *rest)
 
 
-def side_by_side(a: Components, b: Components) -> Components:
-    """The groups of both."""
-    offset = np.concatenate([a.offset, a.offset[-1] + b.offset[1:]])
-    return Components(offset, *(np.concatenate(pair) for pair in zip(a[1:], b[1:], strict=True)))
-
-
 def look(model: HasObjects, scan: Timed, objects: Bernoullis, kind: Ints, state: Floats) -> tuple[Floats, Floats]:
     """h (D, d) and p_D (D,) of further states (D, n), which objects may hide, each by its heaviest component."""
     parts, num = objects.components, len(state)
@@ -213,7 +208,7 @@ def look(model: HasObjects, scan: Timed, objects: Bernoullis, kind: Ints, state:
     return view.predicted[len(best) :], view.detection[len(best) :]
 
 
-def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Knobs, seed: int) -> tuple[Belief, Facts]:
+def step(model: HasObjects, belief: Clouds, scan: Timed, number: int, knobs: Knobs, seed: int) -> tuple[Clouds, Facts]:
     """Predict to the scan, and update by it. `number` of the scan, for labels and random numbers. The scan must not be
     older than the belief."""
     rng, num = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))), knobs.num_particles
@@ -229,7 +224,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
         raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
     born, kept = np.flatnonzero(first > knobs.faint), existence > knobs.faint
     left_out = existence[~kept].sum() + first[first <= knobs.faint].sum()
-    parts = side_by_side(objects.components, unseen)
+    parts = joined(objects.components, unseen)
     fresh = components_of(unseen.offset, mass, born, num, rng)
     whose = np.concatenate([component[kept].ravel(), old + fresh])
     measured = np.concatenate([chosen[kept].ravel(), np.repeat(born, num)])
@@ -238,7 +233,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     family = np.concatenate([belief.family.ravel(), np.arange(len(first_of)) - first_of])
     log_weight = log_weight.reshape(-1, num)
     weight = np.exp(log_weight - log_weight.max(1, keepdims=True))
-    posterior = Belief(
+    posterior = Clouds(
         scan.time,
         np.concatenate([belief.label[kept], number * STRIDE + born]),
         np.concatenate([existence[kept], first[born]]),
@@ -250,7 +245,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     return posterior, Facts(log_factor, int(loopy), float(left_out))
 
 
-def tell(belief: Belief, report: float, period: Floats, num_kinds: int) -> Objects:
+def tell(belief: Clouds, report: float, period: Floats, num_kinds: int) -> Objects:
     """The objects more probable than `report`, by the moments of their particles; angles are circular."""
     told = belief.only(belief.existence > report)
     num, size = len(told.label), told.state.shape[2]

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
 from inference.association_kernel import AUTO, associate
 from inference.lmb_kernel import (
-    LOG_TAU,
     MAX_ITERATIONS,
     TOLERANCE,
-    cholesky,
+    densities,
     longer,
     project,
+    room_for,
     unseen_mass,
-    whiten,
     wrapped,
 )
 from inference.object_particles import LEAST_MISS
@@ -56,8 +53,8 @@ def update(  # type: ignore[no-untyped-def]
         predicted, slope, detection, values, noise, sort, feature, period,
     )  # fmt: skip
     intensity = np.maximum(clutter + rho, 1e-100)  # of measurements that no old object made
-    G, base, C, residual, y = np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d), np.empty(d)
-    mean, variance = np.empty(d), np.empty(d)
+    parts, mean, variance, density = room_for(n, d), np.empty(d), np.empty(d), np.empty(M)
+    G, S = parts[:2]
     table_offset, missed, entries = np.zeros(num + 1, np.int64), np.empty(num), 0
     room = 2 * num + 16
     measurement, ratio, made = np.empty(room, np.int64), np.empty(room), np.empty((room, count))
@@ -69,13 +66,13 @@ def update(  # type: ignore[no-untyped-def]
         start = entries
         if seen > 1e-9:
             seen_moments(weight[t], predicted[first : first + count], period, mean, variance)
-            project(P[best], slope[best], G, base)
+            project(P[best], slope[best], G, S)
             for j in range(M):
-                near = True
+                inside = True
                 for a in range(d):
                     off = wrapped(values[j, a] - mean[a], period[a])
-                    near = near and off * off <= gate * (variance[a] + base[a, a] + noise[sort[j], a, a])
-                if near:
+                    inside = inside and off * off <= gate * (variance[a] + S[a, a] + noise[sort[j], a, a])
+                if inside:
                     if entries == len(ratio):
                         measurement, ratio, made = longer(measurement), longer(ratio), longer(made)
                     measurement[entries], ratio[entries] = j, 0.0
@@ -84,17 +81,12 @@ def update(  # type: ignore[no-untyped-def]
         if entries == start:
             continue
         for i in range(count):
-            project(P[first + i], slope[first + i], G, base)
-            solved, log_norm = -1, 0.0
+            c, near = first + i, measurement[start:entries]
+            densities(P[c], slope[c], predicted[c], values, near, noise, sort, period, np.inf, parts, density)
             for e in range(start, entries):
                 j = measurement[e]
-                if solved != sort[j]:
-                    solved = sort[j]
-                    log_norm = -cholesky(base + noise[solved], C) - 0.5 * d * LOG_TAU
-                for a in range(d):
-                    residual[a] = wrapped(values[j, a] - predicted[first + i, a], period[a])
-                likelihood = feature[j, kind[t, i]] * math.exp(log_norm - 0.5 * whiten(C, residual, y))
-                made[e, i] = existence[t] * weight[t, i] * detection[first + i] * likelihood / intensity[j]
+                likelihood = feature[j, kind[t, i]] * density[e - start]
+                made[e, i] = existence[t] * weight[t, i] * detection[c] * likelihood / intensity[j]
                 ratio[e] += made[e, i]
     taken, free = np.empty(entries), np.empty(num)
     log_partition, loopy, _ = associate(

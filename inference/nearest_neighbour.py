@@ -27,7 +27,7 @@ from inference.lmb_kernel import heaviest
 from inference.refusal import answers_first
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
-from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, no_objects
+from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, no_objects, together
 from models.program import InputError
 
 Floats = NDArray[np.float64]
@@ -54,7 +54,7 @@ class Knobs(NamedTuple):
     least: float = 1e-3
 
 
-class Belief(NamedTuple):
+class Instances(NamedTuple):
     """T instances at a time [s], None before the first scan.
 
     objects  of which existence is one, but for those that just came to known places
@@ -83,10 +83,10 @@ class Fit(NamedTuple):
     covariance: Floats
 
 
-def nobody(size: int) -> Belief:
+def nobody(size: int) -> Instances:
     """Before the first scan."""
     none = np.zeros(0, dtype=np.int64)
-    return Belief(None, no_objects(size), none, none, none, np.zeros(0), none.astype(bool))
+    return Instances(None, no_objects(size), none, none, none, np.zeros(0), none.astype(bool))
 
 
 def fit(components: Components, view: View, rows: slice, gate: float) -> Fit:
@@ -109,7 +109,7 @@ def fit(components: Components, view: View, rows: slice, gate: float) -> Fit:
     return Fit(np.where(square <= gate, chance * density, 0.0), mean, covariance)
 
 
-def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Knobs) -> tuple[Belief, Facts]:
+def step(model: HasObjects, belief: Instances, scan: Timed, number: int, knobs: Knobs) -> tuple[Instances, Facts]:
     """Predict to the scan, associate, update, begin and end. The scan must not be older than the belief."""
     belief = predict(model, belief, scan.time, number)
     objects, (label, existence, components) = belief.objects, belief.objects
@@ -140,16 +140,16 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     fresh = begun(unseen, new, free, knobs.least)
 
     ones = np.ones(len(free), dtype=np.int64)
-    after = lmb.together(
+    after = together(
         Bernoullis(label[keep], np.ones(keep.sum()), old),
         Bernoullis(number * lmb.STRIDE + free, np.ones(len(free)), fresh),
     )
     hits, looks, vain = (np.append(a[keep], b) for a, b in ((hits, ones), (looks, ones), (vain, 0 * ones)))
     last, sure = np.append(last[keep], scan.time * ones), np.append(sure[keep], ones * knobs.hits <= 1)
-    return Belief(scan.time, after, hits, looks, vain, last, sure), Facts(log_factor)
+    return Instances(scan.time, after, hits, looks, vain, last, sure), Facts(log_factor)
 
 
-def predict(model: HasObjects, belief: Belief, now: float, number: int) -> Belief:
+def predict(model: HasObjects, belief: Instances, now: float, number: int) -> Instances:
     """At time `now`, with what came to known places; an instance lives on for sure."""
     if belief.time is None or now <= belief.time:
         return belief
@@ -159,7 +159,7 @@ def predict(model: HasObjects, belief: Belief, now: float, number: int) -> Belie
     more = len(moved.label) - num
     hits, looks, vain = (np.append(values, np.zeros(more, dtype=np.int64)) for values in belief[2:5])
     last, sure = np.append(belief.last, np.full(more, now)), np.append(belief.sure, np.zeros(more, dtype=bool))
-    return Belief(now, moved._replace(existence=existence), hits, looks, vain, last, sure)
+    return Instances(now, moved._replace(existence=existence), hits, looks, vain, last, sure)
 
 
 def summed(components: Components, values: Floats) -> Floats:
@@ -207,7 +207,7 @@ def lighter(components: Components, keep: Any, least: float) -> Components:
     return Components(offset, weight, *(values[stay] for values in components[2:]))
 
 
-def tell(belief: Belief, num_kinds: int) -> Objects:
+def tell(belief: Instances, num_kinds: int) -> Objects:
     """The confirmed ones, each as the heaviest of its filters."""
     mean, covariance, kind = heaviest(*belief.objects.components, num_kinds)
     rows = np.flatnonzero(belief.sure)

@@ -24,7 +24,7 @@ import math
 import numpy as np
 from numba import njit
 
-from inference.lmb_kernel import cholesky, condition, gain, project, whiten, wrapped
+from inference.lmb_kernel import cholesky, condition, gain, innovation, room_for, whiten, wrapped
 
 LEAST_MISS = 1e-12  # 1 - p_D is taken for no less, so that an object that cannot be missed can be
 
@@ -54,20 +54,15 @@ def draw(component, measurement, mean, P, predicted, slope, values, noise, sort,
     """States (D, n) of components (D,) that are measured as measurement (D,), -1 for missed: m+ + root(P+) e, of normal
     numbers e (D, n). Component c has mean[c], P[c], predicted[c] = h, slope[c] = H."""
     num, n, d = len(component), mean.shape[1], values.shape[1]
-    G, S, C, W = np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, n))
-    residual, y, middle, V, root = np.empty(d), np.empty(d), np.empty(n), np.empty((n, n)), np.empty((n, n))
-    found = np.empty((num, n))
+    room, W = room_for(n, d), np.empty((d, n))
+    G, _, C, _, y = room
+    middle, V, root, found = np.empty(n), np.empty((n, n)), np.empty((n, n)), np.empty((num, n))
     for p in range(num):
         c, j = component[p], measurement[p]
         if p == 0 or c != component[p - 1] or j != measurement[p - 1]:
             middle[:], V[:] = mean[c], P[c]
             if j >= 0:
-                project(P[c], slope[c], G, S)
-                S += noise[sort[j]]
-                cholesky(S, C)
-                for a in range(d):
-                    residual[a] = wrapped(values[j, a] - predicted[c, a], period[a])
-                whiten(C, residual, y)
+                innovation(P[c], slope[c], predicted[c], values[j], noise[sort[j]], period, room)
                 gain(C, G, W)
                 condition(mean[c], P[c], W, y, middle, V)
             root_of(V, root)

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from inference.lmb_kernel import LOG_TAU, cholesky, condition, gain, project, whiten, wrapped
+from inference.lmb_kernel import LOG_TAU, condition, densities, gain, innovation, room_for
 
 
 @njit(cache=True, error_model="numpy")
@@ -26,20 +26,15 @@ def see(  # type: ignore[no-untyped-def]
 
     A component to which the measurement is farther than the gate (squared Mahalanobis distance) has none."""
     n, d = mean.shape[1], slope.shape[1]
-    G, S, C, W = np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, n))
-    residual, y, factor = np.empty(d), np.empty(d), np.zeros(len(chosen))
+    room, W, factor = room_for(n, d), np.empty((d, n)), np.zeros(len(chosen))
+    G, _, C, _, y = room
     for t in range(len(chosen)):
         j = chosen[t]
         for c in range(offset[t], offset[t + 1]):
             if j < 0:
                 weight[c] *= 1.0 - detection[c]
             else:
-                project(P[c], slope[c], G, S)
-                S += noise[sort[j]]
-                log_det = cholesky(S, C)
-                for a in range(d):
-                    residual[a] = wrapped(values[j, a] - predicted[c, a], period[a])
-                square = whiten(C, residual, y)
+                square, log_det = innovation(P[c], slope[c], predicted[c], values[j], noise[sort[j]], period, room)
                 if square > gate:
                     weight[c] = 0.0
                 else:
@@ -58,19 +53,12 @@ def weights_of(  # type: ignore[no-untyped-def]
     offset, weight, kind, P, predicted, slope, detection, values, noise, sort, clutter, feature, period, gate
 ):
     """(T, M) what each group would weigh with each measurement: `see`, of all pairs."""
-    d, n, num = slope.shape[1], slope.shape[2], len(offset) - 1
-    G, base, S, C = np.empty((n, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
-    residual, y, found = np.empty(d), np.empty(d), np.zeros((num, len(values)))
+    num, M, room = len(offset) - 1, len(values), room_for(slope.shape[2], slope.shape[1])
+    found, density, every = np.zeros((num, M)), np.empty(M), np.arange(M)
     for t in range(num):
         for c in range(offset[t], offset[t + 1]):
-            project(P[c], slope[c], G, base)
-            for j in range(len(values)):
-                S[:] = base + noise[sort[j]]
-                log_det = cholesky(S, C)
-                for a in range(d):
-                    residual[a] = wrapped(values[j, a] - predicted[c, a], period[a])
-                square = whiten(C, residual, y)
-                if square <= gate:
-                    density = math.exp(-log_det - 0.5 * (square + d * LOG_TAU))
-                    found[t, j] += weight[c] * detection[c] * feature[j, kind[c]] * density
+            densities(P[c], slope[c], predicted[c], values, every, noise, sort, period, gate, room, density)
+            for j in range(M):
+                if density[j] > 0.0:
+                    found[t, j] += weight[c] * detection[c] * feature[j, kind[c]] * density[j]
     return found

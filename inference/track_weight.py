@@ -33,9 +33,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from inference.lmb import moved, together
+from inference.lmb import moved
 from inference.track_kernel import see
-from models.multi_object import Bernoullis, Components, HasObjects, View, no_components, no_objects
+from models.multi_object import Bernoullis, Components, HasObjects, View, no_components, no_objects, together
 from models.program import InputError
 
 Floats = NDArray[np.float64]

@@ -30,7 +30,7 @@ class Dated(Protocol):
     def time(self) -> float | None: ...
 
 
-Belief = TypeVar("Belief", bound=Dated)
+AnyBelief = TypeVar("AnyBelief", bound=Dated)
 
 
 class Facts(NamedTuple):
@@ -63,9 +63,9 @@ def require_objects(model: Any, engine: str) -> None:
 def track(
     model: HasObjects,
     scans: Sequence[Any],
-    belief: Belief,
-    step: Callable[[Belief, Any, int], tuple[Belief, Facts]],
-    tell: Callable[[Belief], Objects],
+    belief: AnyBelief,
+    step: Callable[[AnyBelief, Any, int], tuple[AnyBelief, Facts]],
+    tell: Callable[[AnyBelief], Objects],
     *,
     patience: float,
     progress: bool,

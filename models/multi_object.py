@@ -138,6 +138,20 @@ class HasObjects(Protocol):
     def check(self, scans: Any) -> Sequence[Any]: ...
 
 
+def joined(*parts: Components) -> Components:
+    """The groups of all, one after the other."""
+    begin = np.cumsum([0, *(part.offset[-1] for part in parts)])
+    offset = np.concatenate([begin[:1], *(at + part.offset[1:] for at, part in zip(begin[:-1], parts, strict=True))])
+    _, *columns = zip(*parts, strict=True)
+    return Components(offset, *map(np.concatenate, columns))
+
+
+def together(a: Bernoullis, b: Bernoullis) -> Bernoullis:
+    """The objects of both."""
+    label, existence = np.concatenate([a.label, b.label]), np.concatenate([a.existence, b.existence])
+    return Bernoullis(label, existence, joined(a.components, b.components))
+
+
 def no_components(size: int, num_groups: int = 0) -> Components:
     """Groups without components, of states (size,)."""
     none = np.zeros(0)

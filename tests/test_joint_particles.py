@@ -135,9 +135,9 @@ def test_evidence_existence_and_means_are_those_of_all_histories(count: int) -> 
         assert np.all(error < 0.12)
 
 
-def nobody(num: int) -> joint_particles.Belief:
+def nobody(num: int) -> joint_particles.Scenes:
     none = np.zeros(0, dtype=np.int64)
-    return joint_particles.Belief(None, np.full(num, -math.log(num)), none, none, none, np.zeros((0, 4)), none)
+    return joint_particles.Scenes(None, np.full(num, -math.log(num)), none, none, none, np.zeros((0, 4)), none)
 
 
 def test_two_close_objects_are_tracked_as_by_the_lmb_filter() -> None:
@@ -173,7 +173,7 @@ def test_an_object_outside_every_view_keeps_its_existence() -> None:
     model, num = Traffic((sensor,), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),)), 100
     own = np.arange(70)  # of a hundred particles
     state, none = np.tile([0.0, 30.0, 0.0, 0.0], (70, 1)), np.zeros(70, dtype=np.int64)
-    belief = joint_particles.Belief(0.0, np.full(num, -math.log(num)), none, own, none, state, none)
+    belief = joint_particles.Scenes(0.0, np.full(num, -math.log(num)), none, own, none, state, none)
     for number in range(5):
         scan, knobs = Scan("front", 0.0, np.zeros((0, 2)), POSE), joint_particles.Knobs(num_particles=num)
         belief, _, _ = joint_particles.step(model, belief, scan, number, knobs, 0)
@@ -199,7 +199,7 @@ def test_detection_that_changes_over_the_noise_of_a_step_is_weighed_state_by_sta
     kind, num = Kind(noise=(10.0, 10.0), speed=(0.0, 2.0), lifetime=5.0), 20_000
     model = replace(small(), kinds=(kind,))
     state, none = np.tile([19.0, 0.0, 0.0, 0.0], (num, 1)), np.zeros(num, dtype=np.int64)
-    belief = joint_particles.Belief(0.0, np.full(num, -math.log(num)), none, np.arange(num), none, state, none)
+    belief = joint_particles.Scenes(0.0, np.full(num, -math.log(num)), none, np.arange(num), none, state, none)
     scan, knobs = Scan("plots", STEP, np.zeros((0, 2)), POSE), joint_particles.Knobs(num_particles=num, kernel=0.0)
     belief, facts, _ = joint_particles.step(model, belief, scan, 1, knobs, 0)
     node, weight = np.polynomial.hermite_e.hermegauss(100)

@@ -30,12 +30,12 @@ def plots(detection: float = 0.9, clutter: float = 2.0) -> Traffic:
     return Traffic((sensor,), ConstantVelocity(), (Kind(noise=(1.0, 1.0), speed=(0.0, 3.0)),), unseen_density=3e-4)
 
 
-def certain(mean: Floats, std: Floats, num: int, seed: int, existence: float = 1.0) -> lmb_particles.Belief:
+def certain(mean: Floats, std: Floats, num: int, seed: int, existence: float = 1.0) -> lmb_particles.Clouds:
     """One object at time 0, of N(mean, diag std^2)."""
     state = mean + std * np.random.default_rng(seed).standard_normal((1, num, len(mean)))
     none = np.zeros((1, num), dtype=np.int64)
     even = np.full((1, num), 1.0 / num)
-    return lmb_particles.Belief(0.0, np.zeros(1, dtype=np.int64), np.full(1, existence), even, none, state, none)
+    return lmb_particles.Clouds(0.0, np.zeros(1, dtype=np.int64), np.full(1, existence), even, none, state, none)
 
 
 def test_one_object_that_is_always_detected_is_filtered_as_by_kalman() -> None:

@@ -32,10 +32,9 @@ def states(motion: Motion, num: int = 20) -> Floats:
     return found
 
 
-def settings(motion: Motion, dt: float, std: Floats | None = None, rate: float = 0.0, level: float = 0.0) -> Floats:
-    """One row of what a step depends on; extras all with the same rate and level."""
-    num = len(motion.extras)
-    return np.array([[dt, *(np.ones(len(motion.noises)) if std is None else std), *[rate] * num, *[level] * num]])
+def settings(motion: Motion, dt: float, std: Floats | None = None) -> Floats:
+    """One row of what a step depends on."""
+    return np.array([[dt, *(np.ones(len(motion.noises)) if std is None else std)]])
 
 
 @pytest.mark.parametrize("name", MOTIONS)
@@ -52,7 +51,7 @@ def test_machine_code_casadi_and_torch_agree(name: str) -> None:
 @pytest.mark.parametrize("name", MOTIONS)
 def test_slopes_are_those_of_torch(name: str) -> None:
     motion = MOTIONS[name]
-    x, p, n = states(motion), settings(motion, 0.3, rate=0.2), len(motion.names)
+    x, p, n = states(motion), settings(motion, 0.3), len(motion.names)
     y, J, q = np.empty((len(x), n)), np.empty((len(x), n, n)), torch.from_numpy(p[0])
     move_formula(motion).compiled()(x, p, y, J)
     slopes = torch.func.vmap(torch.func.jacrev(lambda v: move_formula(motion).torch(v, q)))(torch.from_numpy(x))
@@ -80,8 +79,8 @@ def test_constant_turn_is_the_turn_without_acceleration() -> None:
     np.testing.assert_allclose(found, move_formula(ConstantTurn())(start, p)[:, :5], atol=1e-14)
 
 
-def covariance(motion: Motion, x: Floats, dt: float, std: Floats, rate: float = 0.0) -> Floats:
-    found = noise_formula(motion)(x[None], settings(motion, dt, std, rate))[0].reshape(len(x), -1)
+def covariance(motion: Motion, x: Floats, dt: float, std: Floats) -> Floats:
+    found = noise_formula(motion)(x[None], settings(motion, dt, std))[0].reshape(len(x), -1)
     return np.asarray(found @ found.T)
 
 
@@ -137,11 +136,9 @@ def test_nothing_moves_in_no_time() -> None:
         assert not noise_formula(motion)(x, p).any()
 
 
-@pytest.mark.parametrize("rate", [1e-4, 0.5])
-def test_extras_are_drawn_back_to_their_level(rate: float) -> None:
+def test_extras_are_random_walks() -> None:
     motion, std = ConstantTurn(extras=BOX), np.array([0.8, 0.3, 0.1, 0.2, 0.4])
     x = states(motion)[5]
-    found = move_formula(motion)(x[None], settings(motion, 0.7, std, rate, 3.0))[0]
-    np.testing.assert_allclose(found[-2:], 3.0 + (x[-2:] - 3.0) * math.exp(-0.7 * rate), rtol=1e-14)
-    exact = integrated(-rate * np.eye(2), np.diag(std[-2:]), 0.7)
-    np.testing.assert_allclose(covariance(motion, x, 0.7, std, rate)[-2:, -2:], exact, rtol=1e-9)
+    found = move_formula(motion)(x[None], settings(motion, 0.7, std))[0]
+    np.testing.assert_array_equal(found[-2:], x[-2:])
+    np.testing.assert_allclose(covariance(motion, x, 0.7, std)[-2:, -2:], 0.7 * np.diag(std[-2:] ** 2), rtol=1e-14)

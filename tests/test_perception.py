@@ -13,10 +13,10 @@ from models.objects.perception import (
     Masses,
     capability,
     combined,
+    hidden_by_any,
     hidden_share,
     hindrance,
     probability,
-    together,
 )
 
 OPS = SimpleNamespace(
@@ -86,4 +86,4 @@ def test_what_stands_behind_is_hidden() -> None:
 
 def test_several_hide_independently_as_surely_as_they_exist() -> None:
     shares, existence = np.array([[0.5, 0.4]]), np.array([1.0, 0.5])
-    assert together(shares, existence) == pytest.approx([1.0 - 0.5 * 0.8])
+    assert hidden_by_any(shares, existence) == pytest.approx([1.0 - 0.5 * 0.8])

@@ -92,7 +92,11 @@ class ImageBox(BoxSensor):
 
     blur  share of the tangent that is added to the noise of each: errors grow with the box
 
-    A side that the border of the image cuts off says little: scans give it a large noise of its own."""
+    A side that the border of the image cuts off says little: scans give it a large noise of its own.
+
+    The camera is taken to look level: pitch and roll of the car are left out. How high the box stands in the image is
+    not read, so a pitch a makes only `tall` wrong, at an angle e below the horizon by a^2 + 2 a e of itself at most:
+    .03 rad at .1 rad make .7 %, a tenth of `blur`."""
 
     births: bool = False
     blur: tuple[float, float, float] = (0.05, 0.05, 0.07)

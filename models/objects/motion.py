@@ -3,9 +3,7 @@
     x' = f(x, dt) + L(x, dt) e,   e ~ N(0, I)
 
 The first entries of a state are those of the motion; `extras` follow: what an object is like (its box) or where it
-points, each a random walk, or drawn back to a level m at a rate r:
-
-    e' = m + (e - m) exp(-r dt) + N(0, q^2 (1 - exp(-2 r dt)) / 2 r)
+points, each a random walk,   e' = e + N(0, q^2 dt).
 
 CTRA is the motion of vehicles in [K15], section V-A.
 """
@@ -33,12 +31,9 @@ ANGLES = {
 }  # entries of states and measurements that are angles, and their period
 
 
-SLOW = 1e-6  # an extra that relaxes slower than this is a random walk [1/s]
-
-
 class Body(NamedTuple):
     """What a sensor can see of an object: position [m], velocity [m/s], heading [rad], and its box [m] where the state
-    has one; None where it has not. z is the height of its lower side, score how well a detector likes it."""
+    has one; None where it has not. z is the height of its lower side."""
 
     x: Any
     y: Any
@@ -184,37 +179,26 @@ def _twice_integrated_white(dt: Any, q: Any, ops: Any) -> tuple[Scalars, ...]:
 
 @lru_cache
 def move_formula(motion: Motion) -> Formula:
-    """(x; step) -> f(x), step as `step_settings` has it; extras relax to their level."""
-    own, num = len(motion.names) - len(motion.extras), len(motion.noises)
+    """(x; step) -> f(x). A step is dt and standard deviations by `noises`, which f does not read."""
+    own = len(motion.names) - len(motion.extras)
 
     def move(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        rates, levels = p[1 + num : 1 + num + len(motion.extras)], p[1 + num + len(motion.extras) :]
-        relaxed = (m + (e - m) * ops.exp(-r * p[0]) for e, r, m in zip(x[own:], rates, levels, strict=True))
-        return (*motion.move(x, p[0], ops), *relaxed)
+        return (*motion.move(x, p[0], ops), *x[own:])
 
-    return Formula("move", move, len(motion.names), num_settings(motion))
-
-
-def num_settings(motion: Motion) -> int:
-    """Numbers that a step depends on: dt, standard deviations by `noises`, rates and levels of the extras."""
-    return 1 + len(motion.noises) + 2 * len(motion.extras)
+    return Formula("move", move, len(motion.names), 1 + len(motion.noises))
 
 
 @lru_cache
 def noise_formula(motion: Motion) -> Formula:
     """(x; step) -> L (n, m), row after row."""
-    size, num = len(motion.names), len(motion.noises)
-    own = size - len(motion.extras)
+    size, num = len(motion.names), 1 + len(motion.noises)
+    own, first = size - len(motion.extras), num - len(motion.extras)
 
     def noise(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        std = p[1 : 1 + num - len(motion.extras)]
-        columns = [(*column, *(0.0,) * (size - own)) for column in motion.noise(x, p[0], std, ops)]
-        rates = p[1 + num : 1 + num + len(motion.extras)]
-        for entry, q, rate in zip(range(own, size), p[1 + len(std) : 1 + num], rates, strict=True):
-            drawn = 2 * rate > SLOW
-            twice = ops.where(drawn, 2 * rate, 1.0)
-            step = q * ops.sqrt(ops.where(drawn, (1 - ops.exp(-twice * p[0])) / twice, p[0]))
+        columns = [(*column, *(0.0,) * (size - own)) for column in motion.noise(x, p[0], p[1:first], ops)]
+        for entry, q in zip(range(own, size), p[first:num], strict=True):
+            step = q * ops.sqrt(p[0])
             columns.append(tuple(step if i == entry else 0.0 for i in range(size)))
         return tuple(column[i] for i in range(size) for column in columns)
 
-    return Formula("noise", noise, size, num_settings(motion))
+    return Formula("noise", noise, size, num)

@@ -67,7 +67,7 @@ def hidden_share(
     )
 
 
-def together(share: Any, existence: Any) -> Any:
+def hidden_by_any(share: Any, existence: Any) -> Any:
     """(*, N) how much is hidden by any of J others, independently: shares (*, N, J), existence (*, J). Arrays of numpy
     or torch."""
     return 1.0 - (1.0 - share * existence[..., None, :]).prod(-1)

@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from models.objects.motion import move_formula, noise_formula
-from models.objects.perception import together
+from models.objects.perception import hidden_by_any
 from models.objects.scan_set import FalseAlarms, Looks, ScanSet, wrapped
 from models.objects.scans import Scan
 from models.objects.sensors import Sensor, hidden_formula, mounted, spread_formula
@@ -132,7 +132,7 @@ def _hidden(model: Traffic, sensor: Sensor, at: Tensor, kind: Tensor, state: Ten
     x = torch.cat([place[..., :, None, :].expand(*pairs, 2), place[..., None, :, :].expand(*pairs, 2)], -1)
     radii = torch.stack([radius[..., :, None].expand(pairs), radius[..., None, :].expand(pairs)], -1)
     share = hidden_formula().torch(x, torch.cat([at.expand(*pairs, 3), radii], -1))[..., 0]
-    return sensor.occlusion * torch.as_tensor(together(share * (1.0 - torch.eye(num)), exists))
+    return sensor.occlusion * torch.as_tensor(hidden_by_any(share * (1.0 - torch.eye(num)), exists))
 
 
 def simulate_scan(
@@ -190,7 +190,7 @@ def see(model: Traffic, state: State, frame: ScanFrame) -> None:
 
 def _moved(model: Traffic, state: State, dt: float) -> Tensor:
     """f(x, dt) + L e, (*B, S, n)."""
-    x, own = state["state"], torch.from_numpy(model.step_settings)[state["kind"]]  # (*B, S, .)
+    x, own = state["state"], torch.from_numpy(model.noises)[state["kind"]]  # (*B, S, .)
     settings = torch.cat([torch.full((*own.shape[:-1], 1), dt), own], -1)
     L = noise_formula(model.motion).torch(x, settings)
     L = L.unflatten(-1, (len(model.names), -1))

@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.formula import Formula
-from models.multi_object import Bernoullis, Components, Moved, View, no_components, no_objects
+from models.multi_object import Bernoullis, Components, Moved, View, joined, no_components, no_objects
 from models.objects.ground import Ground, limited
 from models.objects.motion import ANGLES, ConstantTurn, Motion, move_formula, noise_formula
 from models.objects.newcomers import lay_out
-from models.objects.perception import together
+from models.objects.perception import hidden_by_any
 from models.objects.scans import Recording, Scan, check_scan
 from models.objects.scene import ScanFrame, State, first, frames_of, in_order, see, step
 from models.objects.sensors import Sensor, hidden_formula, mounted, sensor_formulas
@@ -53,8 +53,6 @@ class Kind:
     speed         mean and standard deviation [m/s] when first seen
     yaw_rate_std, acceleration_std  when first seen [rad/s], [m/s^2]
     extras        (mean, standard deviation) of the motion's extras when first seen
-    rates         at which extras go back to their mean [1/s]: with noise q and rate r their standard deviation tends to
-                  q / sqrt(2 r); none for random walks
     visibility    factor to every sensor's probability to detect it
     radius        of the disc that hides what is behind it [m]
     """
@@ -67,13 +65,11 @@ class Kind:
     yaw_rate_std: float = 0.2
     acceleration_std: float = 0.5
     extras: tuple[tuple[float, float], ...] = ()
-    rates: tuple[float, ...] = ()
     visibility: float = 1.0
     radius: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "extras", tuple(tuple(pair) for pair in self.extras))  # configs have lists
-        object.__setattr__(self, "rates", tuple(self.rates) or (0.0,) * len(self.extras))
         for what in ("share", "lifetime", "radius"):
             if not 0.0 < getattr(self, what) < math.inf:
                 raise InputError(f"kind {self.name}: {what} is {getattr(self, what)}; give a positive number")
@@ -145,10 +141,9 @@ class Traffic:
         return {sensor.name: sensor for sensor in self.sensors}
 
     @cached_property
-    def step_settings(self) -> Floats:
-        """(C, .) what a step depends on but its time, of each kind: noises, rates and levels of the extras."""
-        levels = [[mean for mean, _ in kind.extras] for kind in self.kinds]
-        return np.array([(*k.noise, *k.rates, *m) for k, m in zip(self.kinds, levels, strict=True)])
+    def noises(self) -> Floats:
+        """(C, .) standard deviations by the motion's `noises`, of each kind."""
+        return np.array([kind.noise for kind in self.kinds])
 
     @cached_property
     def visibility(self) -> Floats:
@@ -265,8 +260,8 @@ class Traffic:
         size, num = len(self.names), len(kind)
         moved, slope = np.empty((num, size)), np.empty((num, size, size))
         noise = np.empty((num, noise_formula(self.motion).num_y))
-        settings = np.empty((num, 1 + self.step_settings.shape[1]))
-        settings[:, 0], settings[:, 1:] = seconds, self.step_settings[kind]
+        settings = np.empty((num, 1 + self.noises.shape[1]))
+        settings[:, 0], settings[:, 1:] = seconds, self.noises[kind]
         move_formula(self.motion).compiled()(mean, settings, moved, slope)
         noise_formula(self.motion).compiled(jacobian=False)(mean, settings, noise)
         return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self._lifetime[kind]))
@@ -305,7 +300,7 @@ class Traffic:
         p[..., :3], p[..., 3], p[..., 4] = at, self._radius[kind][:, None], self._radius[parts.kind[best]]
         share = hidden_formula()(x.reshape(-1, 4), p.reshape(-1, 5)).reshape(x.shape[:2])
         share[np.arange(len(parts.mean)), parts.group] = 0.0  # nobody hides itself
-        return np.asarray(sensor.occlusion * together(share, objects.existence))
+        return np.asarray(sensor.occlusion * hidden_by_any(share, objects.existence))
 
     def unseen(self, scan: Scan) -> Components:
         sensor, size, num = self.sensor(scan), len(self.names), len(scan.values)
@@ -337,7 +332,7 @@ class Traffic:
         for i, place in enumerate(self.places):
             known = () if place.heading is None else (np.array([[place.heading[0]]]), np.array([place.heading[1]]))
             groups.append(self._newcomers(np.ones(1), position[i : i + 1], covariance[i : i + 1], *known))
-        return Bernoullis(np.zeros(len(self.places), dtype=np.int64), existence, _joined(groups))
+        return Bernoullis(np.zeros(len(self.places), dtype=np.int64), existence, joined(*groups))
 
     def _newcomers(
         self,
@@ -379,9 +374,3 @@ def _state_prior(motion: Motion, kind: Kind) -> tuple[Floats, Floats]:
     known |= dict.fromkeys(("x", "y", "heading"), (0.0, 0.0))
     loc, std = zip(*(known[name] for name in motion.names), strict=True)
     return np.array(loc), np.array(std)
-
-
-def _joined(groups: Sequence[Components]) -> Components:
-    offset = np.cumsum([0, *(len(group.weight) for group in groups)])
-    parts = (np.concatenate([group[i] for group in groups]) for i in range(1, 5))
-    return Components(offset, *parts)

@@ -88,7 +88,7 @@ def test_a_calibration_finds_the_weights_that_made_the_labels() -> None:
 @pytest.mark.parametrize(("on", "off"), [(0.7, 0.3), (0.5, 0.5), (0.6, 0.5)])
 def test_reports_go_on_until_a_track_is_clearly_gone(on: float, off: float) -> None:
     rng = np.random.default_rng(4)
-    track, p = rng.integers(0, 9, 600), rng.choice([0.1, off, 0.4, 0.55, on, 0.9], 600)
+    track, p = rng.integers(0, 99, 600), rng.choice([0.1, off, 0.4, 0.55, on, 0.9], 600)
     telling, expected = dict[int, bool](), []
     for name, value in zip(track.tolist(), p, strict=True):
         telling[name] = value > (off if telling.get(name, False) else on)

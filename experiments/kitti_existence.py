@@ -7,12 +7,9 @@ like so far, and where it is:
     p = 1 / (1 + exp(-w (1, a))),   a the features, standardised, within +-3
     w = argmax sum log p(y | a) - |w|^2 / 2
 
-y says whether the labels confirm a row, by the rules of experiments.kitti_matching; rows that those leave out are left
-out. It is fitted on other sequences than the one it judges (`leave_one_out`). A track is reported from p > 0.6 on until
-p < 0.4: at one threshold a p about it would break tracks. All of it is causal.
-
-Only w, middle and scale are fitted so. Which features there are, and the two thresholds, were chosen by the scores of
-all 13 sequences together.
+y says whether the labels confirm a row. A track is reported from p > on until p <= off: at one threshold a p about it
+would break tracks. All of it is causal. What is learnt of labels (experiments.kitti_folds) is learnt on other sequences
+than the one it judges; which features there are was chosen by the scores of all 13 sequences together.
 
 Features without bounds (powers of the range, height over the road) fail on other sequences than those of the fit."""
 
@@ -27,18 +24,18 @@ from scipy.signal import lfilter
 from scipy.special import expit, logit
 
 from experiments.kitti_boxes import image_boxes, in_view
-from experiments.kitti_matching import TrackBoxes, boxes_of, compare, match
-from experiments.scenarios.kitti_scans import CAMERA, LASER, KittiTruth
+from experiments.kitti_matching import TrackBoxes, boxes_of
+from experiments.scenarios.kitti_scans import CAMERA, LASER
 from experiments.scenarios.kitti_tracking import KittiSequence
 from inference.tracks import Tracks, rows_by_label
 from models.objects.scans import Scan
 from models.program import InputError
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 BOUND = 3.0  # of standardised features
-ON, OFF = 0.6, 0.4
 FAINT = 1e-4  # r is taken to be no nearer to 0 and 1
 LONG = 6  # scans without a detection beyond which no more are counted
 FADE, SHARE = 0.85, 0.5  # of older detections, and of the newest, in the evidence of the scores
@@ -178,17 +175,6 @@ def past_of(tracks: Tracks, scans: Sequence[Scan], sensor: str) -> Past:
     return found
 
 
-def labelled(truth: KittiTruth, boxes: TrackBoxes) -> tuple[Bools, Bools]:
-    """Which boxes (R,) the labels confirm, and which count: the rules of experiments.kitti_matching."""
-    compared = compare(truth.sequence, truth.labels, boxes)
-    pair = match(compared, np.ones(len(boxes.track), dtype=bool))
-    paired = np.flatnonzero(pair >= 0)
-    confirmed, counts = np.zeros(len(boxes.track), dtype=bool), ~compared.small
-    box = compared.pairs[pair[paired], 1]
-    confirmed[box], counts[box] = True, ~compared.left_out[paired]
-    return confirmed, counts
-
-
 def fit(features: Floats, confirmed: Bools, *, ridge: float = 1.0, steps: int = 30) -> Calibration:
     """Newton's steps to the maximum. Raises InputError without rows of both sorts."""
     if confirmed.all() or not confirmed.any():
@@ -208,36 +194,12 @@ def _design(features: Floats, middle: Floats, scale: Floats) -> Floats:
     return np.concatenate([np.ones((len(bounded), 1)), bounded], 1)
 
 
-def fit_all(truths: Sequence[KittiTruth], found: Sequence[Candidates]) -> Calibration:
-    """The calibration of several sequences."""
-    features, confirmed = list[Floats](), list[Bools]()
-    for truth, some in zip(truths, found, strict=True):
-        y, counts = labelled(truth, some.boxes)
-        used = counts & some.shown
-        features.append(some.features[used])
-        confirmed.append(y[used])
-    return fit(np.concatenate(features), np.concatenate(confirmed))
-
-
-def report(found: Candidates, calibration: Calibration, *, on: float = ON, off: float = OFF) -> TrackBoxes:
-    """What is told of: tracks from p > on until p < off, where they are in the image; their score is p."""
-    p = calibration.probability(found.features)
-    told, telling = np.zeros(len(p), dtype=bool), set[int]()
-    for row, label in enumerate(found.boxes.track.tolist()):
-        told[row] = p[row] > (off if label in telling else on)
-        (telling.add if told[row] else telling.discard)(label)
-    told &= found.shown
-    offset = np.concatenate([[0], np.cumsum(told)])[found.boxes.offset]
-    return TrackBoxes(offset, found.boxes.track[told], found.boxes.box[told], p[told])
-
-
-def leave_one_out(
-    truths: Sequence[KittiTruth], found: Sequence[Candidates], *, on: float = ON, off: float = OFF
-) -> list[TrackBoxes]:
-    """What is told of in each sequence, calibrated on all others."""
-    told = list[TrackBoxes]()
-    for i in range(len(found)):
-        others = [j for j in range(len(found)) if j != i]
-        calibration = fit_all([truths[j] for j in others], [found[j] for j in others])
-        told.append(report(found[i], calibration, on=on, off=off))
-    return told
+def told(track: Ints, p: Floats, *, on: float, off: float) -> Bools:
+    """Which rows (R,), in the order of time, are told of: from p > on until p <= off; on is not below off."""
+    order = np.argsort(track, kind="stable")
+    track, p = track[order], p[order]
+    first = np.diff(track, prepend=-1) != 0
+    decided = np.maximum.accumulate(np.where(first | (p > on) | (p <= off), np.arange(len(p)), 0))
+    found = np.zeros(len(p), dtype=bool)
+    found[order] = (p > on)[decided]
+    return found

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from experiments.kitti_evaluation import evaluate
-from experiments.kitti_existence import Candidates, candidates, fit_all, report
+from experiments.kitti_existence import candidates
+from experiments.kitti_folds import Labelled, label, learn, report
 from experiments.scenarios.junction import DATA_ROOT
-from experiments.scenarios.kitti_scans import CAMERA, KittiTruth, kitti_scans
+from experiments.scenarios.kitti_scans import KittiTruth, kitti_scans
 from experiments.scenarios.kitti_tracking import sequences
 from experiments.scenarios.scene import Scene, TrafficTruth
 from inference.posterior import Posterior
@@ -21,30 +22,30 @@ KEPT = ("mota", "hota", "idf1", "ids", "frag", "recall", "precision")
 
 
 def followed(
-    traffic: Traffic, follow: Callable[..., Tracks], sequence: str, *, camera: bool = False, data_root: str = DATA_ROOT
-) -> tuple[KittiTruth, Candidates, Tracks]:
-    """What a filter holds possible in a sequence."""
-    scene = kitti_scans(sequence, camera, data_root)
+    traffic: Traffic, follow: Callable[..., Tracks], sequence: str, *, data_root: str = DATA_ROOT, **readings: Any
+) -> tuple[KittiTruth, Labelled, Tracks]:
+    """What a filter holds possible in a sequence; `readings` are those of experiments.scenarios.kitti_scans."""
+    scene = kitti_scans(sequence, data_root=data_root, **readings)
     tracks = follow(traffic, scene.data.scans)
-    return scene.truth, candidates(tracks, scene.data.scans, scene.truth.sequence), tracks
+    found = candidates(tracks, scene.data.scans, scene.truth.sequence)
+    return scene.truth, label(scene.truth, found), tracks
 
 
 def metrics(
     posterior: Posterior, scene: Scene, *, traffic: Traffic, follow: Callable[..., Tracks], data_root: str = DATA_ROOT
 ) -> dict[str, float]:
-    """experiments.kitti_evaluation of the boxes that the filter reports, and the median time of a frame [ms]. Existence
-    is calibrated (experiments.kitti_existence) on all other sequences that are there: the filter `follow` runs on each
-    of them. Nothing without tracks of a sequence of KITTI."""
+    """experiments.kitti_evaluation of the boxes that the filter reports, and the median time of a frame [ms]. What
+    labels teach (experiments.kitti_folds) is learnt on all other sequences that are there: the filter `follow` runs on
+    each of them. Nothing without tracks of a sequence of KITTI."""
     if not isinstance(posterior, Tracks) or not isinstance(scene.truth, KittiTruth):
         return {}
-    own, camera = scene.truth.sequence, CAMERA in posterior.sensor
+    own = scene.truth.sequence
     others = [
-        followed(traffic, follow, name, camera=camera, data_root=data_root)
+        followed(traffic, follow, name, data_root=data_root, **scene.info["readings"])[1]
         for name in sequences(data_root)
         if name != own.name
     ]
-    calibration = fit_all([truth for truth, _, _ in others], [found for _, found, _ in others])
-    boxes = report(candidates(posterior, scene.data.scans, own), calibration)
+    boxes = report(candidates(posterior, scene.data.scans, own), learn(others))
     scores = evaluate([scene_of(scene.truth)], [boxes], average=False)
     ms = 1e3 * float(np.median(frame_seconds(posterior)))
     return {f"kitti_{name}": scores[name] for name in KEPT} | {"kitti_ms_per_frame": ms}

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.kitti_boxes import image_boxes, to_world
+from experiments.kitti_existence import Candidates
 from experiments.kitti_matching import TrackBoxes
+from experiments.scenarios.kitti_scans import KittiTruth
 from experiments.scenarios.kitti_tracking import CameraBoxes, Detections, KittiLabels, KittiSequence
 from experiments.scenarios.scene import Scene
 
@@ -85,3 +87,14 @@ def report(rows: list[tuple[int, int, np.ndarray]], num_frames: int, score: floa
         np.array([row[2] for row in rows]).reshape(-1, 7),
         np.full(len(rows), score),
     )
+
+
+def beside_a_hedge(seed: int) -> tuple[KittiTruth, Candidates]:
+    """A car that stands (track 5), and something beside it that looks less like one (track 6); the one feature says
+    which, not surely."""
+    rng, frames = np.random.default_rng(seed), 40
+    whole = scene([(t, 0, car(-3.0)) for t in range(frames)], frames)
+    box = np.array([car(-3.0), car(3.0)] * frames)
+    boxes = TrackBoxes(2 * np.arange(frames + 1), np.tile([5, 6], frames), box, np.full(2 * frames, 0.5))
+    feature = np.tile([1.0, -1.0], frames) + rng.normal(0.0, 0.5, 2 * frames)
+    return KittiTruth(whole.data, whole.truth), Candidates(boxes, feature[:, None], np.ones(2 * frames, dtype=bool))

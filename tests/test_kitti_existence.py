@@ -9,21 +9,9 @@ import pytest
 from scipy.special import expit
 
 from benchmarks import kitti_tracking as benchmark
-from experiments.kitti_boxes import image_boxes
-from experiments.kitti_existence import (
-    Candidates,
-    Past,
-    candidates,
-    fit,
-    fit_all,
-    labelled,
-    leave_one_out,
-    past_of,
-    report,
-)
-from experiments.kitti_matching import TrackBoxes
+from experiments.kitti_existence import Past, candidates, fit, past_of, told
 from experiments.kitti_metrics import paths_of
-from experiments.scenarios.kitti_scans import CAMERA, LASER, KittiTruth, scans_of
+from experiments.scenarios.kitti_scans import CAMERA, LASER, scans_of
 from experiments.scenarios.kitti_tracking import CameraBoxes, Detections
 from inference.tracks import Tracks
 from models.objects.box_detector import BoxDetector, ImageBox
@@ -31,7 +19,7 @@ from models.objects.motion import ConstantTurn
 from models.objects.scans import Scan
 from models.objects.sensors import sensor_formulas
 from models.program import InputError
-from tests.drawn_cars import IMAGE, PROJECTION, car, scene
+from tests.drawn_cars import beside_a_hedge, car, scene
 
 
 def tracks_of(rows: list[tuple[int, int, int]], sensor: tuple[str, ...], time: np.ndarray) -> Tracks:
@@ -97,61 +85,19 @@ def test_a_calibration_finds_the_weights_that_made_the_labels() -> None:
         fit(a, np.ones(len(a), dtype=bool))
 
 
-def made_up(seed: int) -> tuple[KittiTruth, Candidates]:
-    """A car that stands, and something beside it that looks less like one; the feature says which, not surely."""
-    rng, frames = np.random.default_rng(seed), 40
-    whole = scene([(t, 0, car(-3.0)) for t in range(frames)], frames)
-    box = np.array([car(-3.0), car(3.0)] * frames)
-    boxes = TrackBoxes(2 * np.arange(frames + 1), np.tile([5, 6], frames), box, np.full(2 * frames, 0.5))
-    feature = np.tile([1.0, -1.0], frames) + rng.normal(0.0, 0.5, 2 * frames)
-    return KittiTruth(whole.data, whole.truth), Candidates(boxes, feature[:, None], np.ones(2 * frames, dtype=bool))
-
-
-def test_labels_confirm_what_they_overlap_and_leave_out_what_is_small() -> None:
-    truth, found = made_up(0)
-    confirmed, counts = labelled(truth, found.boxes)
-    np.testing.assert_array_equal(confirmed, np.tile([True, False], 40))
-    assert counts.all()
-    far = found.boxes._replace(box=np.array([car(-3.0), car(3.0, 60.0)] * 40))
-    assert (image_boxes(far.box[1:2], PROJECTION, IMAGE)[0] @ [0, -1, 0, 1]) < 25.0
-    confirmed, counts = labelled(truth, far)
-    np.testing.assert_array_equal(counts, np.tile([True, False], 40))
-    vans = KittiTruth(truth.sequence, truth.labels._replace(kind=np.full(40, "Van")))
-    assert not labelled(vans, found.boxes)[1][::2].any()
-
-
-def test_a_sequence_is_judged_by_what_the_others_taught() -> None:
-    truths, found = zip(*(made_up(seed) for seed in range(3)), strict=True)
-    told = leave_one_out(truths, found)
-    by_hand = report(found[0], fit_all(truths[1:], found[1:]))
-    np.testing.assert_array_equal(told[0].score, by_hand.score)
-    # its own labels change nothing of what is told of it
-    lied = truths[0]._replace(labels=truths[0].labels._replace(kind=np.full(40, "Van")))
-    again = leave_one_out([lied, *truths[1:]], found)
-    np.testing.assert_array_equal(again[0].score, told[0].score)
-    assert not np.array_equal(again[1].score, told[1].score)
-    assert (told[0].track == 5).mean() > 0.8
-
-
-def test_reports_go_on_until_a_track_is_clearly_gone() -> None:
-    _, found = made_up(0)
-    truths, others = zip(*(made_up(seed) for seed in range(1, 3)), strict=True)
-    calibration = fit_all(truths, others)
-    p = calibration.probability(found.features)
-    for label, rows in ((5, slice(0, None, 2)), (6, slice(1, None, 2))):
-        telling, expected = False, []
-        for value in p[rows]:
-            telling = value > (0.3 if telling else 0.7)
-            expected.append(telling)
-        told = report(found, calibration, on=0.7, off=0.3)
-        frame = np.repeat(np.arange(40), np.diff(told.offset))[told.track == label]
-        np.testing.assert_array_equal(frame, np.flatnonzero(expected))
-    hidden = report(found._replace(shown=np.zeros(80, dtype=bool)), calibration)
-    assert len(hidden.track) == 0 and hidden.offset[-1] == 0
+@pytest.mark.parametrize(("on", "off"), [(0.7, 0.3), (0.5, 0.5), (0.6, 0.5)])
+def test_reports_go_on_until_a_track_is_clearly_gone(on: float, off: float) -> None:
+    rng = np.random.default_rng(4)
+    track, p = rng.integers(0, 99, 600), rng.choice([0.1, off, 0.4, 0.55, on, 0.9], 600)
+    telling, expected = dict[int, bool](), []
+    for name, value in zip(track.tolist(), p, strict=True):
+        telling[name] = value > (off if telling.get(name, False) else on)
+        expected.append(telling[name])
+    np.testing.assert_array_equal(told(track, p, on=on, off=off), expected)
 
 
 def test_tracks_that_do_not_say_what_they_were_seen_by_are_refused() -> None:
-    truth, _ = made_up(0)
+    truth, _ = beside_a_hedge(0)
     tracks = tracks_of([(0, 0, 0)], (LASER,), np.array([0.0]))
     with pytest.raises(InputError, match="are not of sequence made up"):
         candidates(tracks, [], truth.sequence)
@@ -197,11 +143,14 @@ def test_scans_are_what_the_sensors_measure_of_a_box() -> None:
     std = np.sqrt(np.diagonal(laser.noise, 0, 1, 2))
     np.testing.assert_allclose(std[1] * [1, laser.values[1, 0], 1, 1, 1, 1, 1], [0.12, 0.07, 0.05, 0.08, 0.1, 0.1, 0.3])
     np.testing.assert_allclose(std[0, 2:] / std[1, 2:], np.exp(0.15 * 5.0))
+    other = scans_of(sequence, slope=0.4, sharpening=0.1)[0]
+    np.testing.assert_allclose(other.score, [0.5, expit(0.4 * 5.0)])
+    np.testing.assert_allclose(np.sqrt(np.diagonal(other.noise, 0, 1, 2))[0, 2:] / std[1, 2:], np.exp(0.1 * 5.0))
     assert (np.diagonal(camera.noise, 0, 1, 2)[1] == 1.0).tolist() == [False, True, False]  # cut off at the right
 
 
 def test_pictures_show_the_paths_of_cars_and_vans_only() -> None:
-    truth, _ = made_up(0)
+    truth, _ = beside_a_hedge(0)
     labels = truth.labels
     kind = labels.kind.copy()
     kind[0] = "Pedestrian"

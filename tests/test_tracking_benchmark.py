@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
 
 from benchmarks import tracking, tracking_peers
 from benchmarks.timing import THREADS
+from benchmarks.tracking_accuracy import close, mean_ratio
 from benchmarks.tracking_peers import Score, best_of
 from benchmarks.tracking_trials import CUTOFF, Effort, ospa_m, plots, ratio
 from experiments.scenarios.crossing_targets import crossing_targets
@@ -75,6 +77,16 @@ def test_the_best_tracker_has_the_least_error_and_a_ratio_is_that_of_means() -> 
     assert best_of(found) == "jpda"
     value = ratio([1.0, 2.0], [2.0, 2.0])
     assert value.value == 0.75 and f"s.e. {np.std([-0.5, 0.5], ddof=1) / 2**0.5 / 2:.3f}" in value.detail
+
+
+def test_company_is_compared_before_and_after_it_has_settled() -> None:
+    """All scans alike, whoever is worse in which scene."""
+    ours, theirs = [np.array([1.0, 3.0]), np.array([5.0, 3.0])], [np.array([4.0, 4.0]), np.array([1.0, 3.0])]
+    assert mean_ratio(ours, theirs) == 1.0
+    assert mean_ratio([each[:1] for each in ours], [each[:1] for each in theirs]) == 1.2
+    detail = close(TINY)["close_ratio"].detail
+    found = re.search(r"3 scenes.*; the first 20 scans (\S+), then (\S+)$", detail)
+    assert found and all(0.0 < float(part) < 3.0 for part in found.groups())
 
 
 def test_without_stone_soup_its_figures_say_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,7 +131,8 @@ class ScanSet(TorchDistribution):
     def tables(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Log weights of an association: of objects detected as measurements (*B, S, M), of objects missed (*B, S),
         and of measurements that are false alarms (*B, M)."""
-        present, z, feature = value[..., 0] > 0.5, value[..., 1 : 1 + len(self.period)], value[..., -self.num_kinds :]
+        present, feature = value[..., 0] > 0.5, value[..., -self.num_kinds :]
+        z = torch.where(present[..., None], value[..., 1 : 1 + len(self.period)], 0.0)
         residual = wrapped(z[..., None, :, :] - self.predicted[..., :, None, :], self.period)  # (*B, S, M, d)
         factor = torch.linalg.cholesky(self.noise)
         white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]

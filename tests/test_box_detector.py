@@ -120,6 +120,14 @@ def test_an_image_box_is_the_hull_of_the_four_corners() -> None:
     np.testing.assert_allclose(found[1], [math.atan2(5.0, 19.2), math.atan2(1.0, 20.8), 1.5 / 19.2], rtol=1e-12)
 
 
+def test_corners_behind_the_camera_are_at_its_plane() -> None:
+    """A car beside the camera, half of it passed: it reaches the border of what can be seen, and errors stay finite."""
+    measure, _ = sensor_formulas(TURN, ImageBox, len(IMAGE.settings))
+    x = np.array([[1.0, 3.0, 0.0, 0.0, 0.0, 0.0, 1.5, 1.6, 4.0]])
+    found = measure(x, np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(found, [math.atan2(3.8, 0.3), math.atan2(2.2, 3.0), 1.5 / 0.3], rtol=1e-12)
+
+
 def test_detection_ends_softly_at_the_border_of_the_image_and_far_away() -> None:
     _, detect = sensor_formulas(TURN, BoxDetector, len(LASER.settings))
 

@@ -280,7 +280,7 @@ EYE = np.broadcast_to(np.eye(2), (2, 2, 2))
         ({"time": -1.0}, "time -1"),
         ({"values": np.array([[30.0, math.nan], [20.0, 0.2]])}, r"'laser' at 1.5 s has nan in its values.*\[0, 1\]"),
         ({"values": np.zeros((2, 3))}, r"values of \(range, bearing\) of shape \(2, 3\); give \(2, 2\)"),
-        ({"pose": np.array([0.0, math.inf, 0.0])}, "inf in its pose"),
+        ({"pose": np.array([0.0, math.inf, 0.0])}, r"inf in its pose.*give where the car was"),
         ({"noise": EYE[:1]}, r"covariances of shape \(1, 2, 2\)"),
         ({"noise": EYE * [[[1.0]], [[-1.0]]]}, "not symmetric and positive definite, of measurement 1"),
         ({"noise": EYE + np.array([[0.0, 0.3], [0.0, 0.0]])}, "not symmetric and positive definite, of measurement 0"),

@@ -114,6 +114,18 @@ def test_the_probabilities_of_draws_sum_to_one_and_are_those_drawn() -> None:
             assert stats.chisquare(found, num * p).pvalue > 1e-4
 
 
+def test_near_partners_are_later_and_earlier_ones() -> None:
+    """B(h | g) ~ N(h | g) + N(g | h), of what is informed about both."""
+    model = small_model()
+    later, near, _ = proposals(model, window_of(model, small_scans()), reach=5)
+    num = len(later.offset) - 1
+    N, B = np.zeros((2, num, num))
+    for table, by in ((N, later), (B, near)):
+        table[np.repeat(np.arange(num), np.diff(by.offset)), by.choice] = by.share
+    both = N + N.T
+    np.testing.assert_allclose(B, both / both.sum(1, keepdims=True), atol=1e-12)
+
+
 def test_a_ratio_left_out_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     true = track_moves.relink
 

@@ -306,3 +306,11 @@ def test_settings_out_of_range_are_refused() -> None:
         lmb_particles.run(plots(), crossing(plots(), 1), kernel=1.5)
     with pytest.raises(InputError, match="lmb_particles needs a model of many objects"):
         lmb_particles.run(object(), [])  # type: ignore[arg-type]
+
+
+def test_empty_scans_of_nobody_are_scans() -> None:
+    scans = [Scan("plots", 0.1 * t, np.zeros((0, 2)), POSE) for t in range(3)]
+    scans.append(Scan("plots", 0.3, np.array([[1.0, 2.0]]), POSE))
+    found = lmb_particles.run(plots(), scans, num_particles=50)
+    assert np.diff(found.offset).tolist() == [0, 0, 0, 1]
+    assert found.existence == pytest.approx(lmb.run(plots(), scans).existence, rel=1e-9)

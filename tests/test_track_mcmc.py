@@ -288,3 +288,26 @@ def test_numbers_out_of_range_are_refused_in_words(knobs: dict[str, Any], messag
 def test_another_model_is_refused_in_words() -> None:
     with pytest.raises(InputError, match="track_mcmc needs a model of many objects"):
         track_mcmc.run(object(), small_scans(), seed=0)  # type: ignore[arg-type]
+
+
+def test_the_best_partition_is_told() -> None:
+    model = small_model(ONE_KIND)
+    scans = small_scans()
+    window = window_of(model, scans)
+    exact = posterior(model, window)
+    best = max(exact, key=lambda tracks: exact[tracks])
+    found = track_mcmc.run(model, scans, seed=0, start="nothing", num_chains=2, num_steps=1000, warmup=100)
+    track = np.full(len(window.scan), -1)
+    for rank, own in enumerate(best):
+        track[list(own)] = rank
+    assert found.estimate["track"].tolist() == track.tolist()
+
+
+def test_objects_are_counted_as_probably_as_they_are_there() -> None:
+    model, rng = small_model(ONE_KIND), np.random.default_rng(0)
+    window = window_of(model, small_scans())
+    library = Library(model, window, np.inf)
+    library.learn([((0,), ()), ((1,), ())])
+    found = np.mean([track_mcmc._count(window, library, ((0,), (1,)), rng) for _ in range(4000)], 0)
+    alive = sum(np.pad(library.weights[g,].alive, (0, 3))[:3] for g in (0, 1))
+    np.testing.assert_allclose(found, alive, atol=4 * np.sqrt(2 * 0.25 / 4000))

@@ -308,9 +308,9 @@ def test_empty_and_huge_scans_are_scans() -> None:
 
 
 def test_a_mount_turns_with_the_car() -> None:
-    """One metre ahead and two to the left, on a car that looks along y."""
-    pose = np.array([10.0, 20.0, math.pi / 2])
-    np.testing.assert_allclose(mounted(pose, (1.0, 2.0, 0.3)), [8.0, 21.0, math.pi / 2 + 0.3], atol=1e-12)
+    """One metre ahead and two to the left, on a car that looks along (.6, .8)."""
+    pose = np.array([10.0, 20.0, math.atan2(0.8, 0.6)])
+    np.testing.assert_allclose(mounted(pose, (1.0, 2.0, 0.3)), [9.0, 22.0, pose[2] + 0.3], atol=1e-12)
 
 
 def test_range_rates_are_the_slope_of_the_range() -> None:

@@ -21,9 +21,9 @@ from functools import cache, partial
 from typing import Any, NamedTuple
 
 from benchmarks import command
+from benchmarks.configured import made
 from benchmarks.figure import Figure, Measurement, Value, Values
 from benchmarks.kitti_baseline import DATA, PUBLIC, Effort
-from benchmarks.kitti_tracking import configured
 from models.program import InputError
 
 
@@ -83,7 +83,8 @@ def follow(effort: Effort, camera: bool) -> dict[str, Value]:
     from experiments.scenarios.kitti_tracking import kitti_tracking, sequences
     from inference.progress import Progress
 
-    model, engine = configured("kitti_tracking_camera" if camera else "kitti_tracking")
+    experiment = "kitti_tracking_camera" if camera else "kitti_tracking"
+    model, engine = made([f"experiment={experiment}", "engine.progress=false"], "model", "engine")
     names = sequences(DATA)[: effort.scenes]
     trial = cache(partial(attempt, model, engine, names, camera))
     start = Settings(model.sensors[0].clutter_density, model.sensors[0].occlusion, SLOPE, SHARPENING)

@@ -203,7 +203,7 @@ def look(model: HasObjects, scan: Timed, objects: Bernoullis, kind: Ints, state:
     one = np.arange(len(best) + 1)
     few = Components(one, np.ones(len(best)), parts.kind[best], parts.mean[best], parts.covariance[best])
     flat = np.broadcast_to(np.zeros((state.shape[1], state.shape[1])), (num, state.shape[1], state.shape[1]))
-    more = Components(np.array([0, num]), np.full(num, 1.0 / num), kind, state, flat)
+    more = Components(np.array([0, num]), np.full(num, 1.0 / max(num, 1)), kind, state, flat)
     view = model.view(scan, objects._replace(components=few), more)
     return view.predicted[len(best) :], view.detection[len(best) :]
 

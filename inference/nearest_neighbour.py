@@ -25,6 +25,7 @@ from inference import lmb
 from inference.association import MISSED, Table, best
 from inference.lmb_kernel import heaviest
 from inference.refusal import answers_first
+from inference.track_kernel import see, weights_of
 from inference.tracking import Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, no_objects, together
@@ -74,39 +75,10 @@ class Instances(NamedTuple):
     sure: NDArray[np.bool_]
 
 
-class Fit(NamedTuple):
-    """How N components fit M measurements: share (N, M) = w p_D g(z | x), 0 beyond the gate, and what they become,
-    mean (N, M, n) and covariance (N, M, n, n)."""
-
-    share: Floats
-    mean: Floats
-    covariance: Floats
-
-
 def nobody(size: int) -> Instances:
     """Before the first scan."""
     none = np.zeros(0, dtype=np.int64)
     return Instances(None, no_objects(size), none, none, none, np.zeros(0), none.astype(bool))
-
-
-def fit(components: Components, view: View, rows: slice, gate: float) -> Fit:
-    """Of the components that stand at `rows` of the view."""
-    H, P = view.slope[rows], components.covariance
-    cross = P @ H.swapaxes(1, 2)  # (N, n, d)
-    S = (H @ cross)[:, None] + view.noise[view.sort]  # (N, M, d, d)
-    residual = view.values - view.predicted[rows, None]
-    turning = np.isfinite(view.period)
-    turn = view.period[turning]
-    residual[..., turning] -= turn * np.floor(residual[..., turning] / turn + 0.5)
-    inverse = np.linalg.inv(S)
-    square = np.einsum("nmi,nmij,nmj->nm", residual, inverse, residual)
-    density = np.exp(-0.5 * square) / np.sqrt(np.linalg.det(2 * np.pi * S))
-    chance = (components.weight * view.detection[rows])[:, None] * view.feature[:, components.kind].T
-    gain = cross[:, None] @ inverse  # (N, M, n, d)
-    mean = components.mean[:, None] + (gain @ residual[..., None])[..., 0]
-    covariance = P[:, None] - gain @ cross.swapaxes(1, 2)[:, None]
-    covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
-    return Fit(np.where(square <= gate, chance * density, 0.0), mean, covariance)
 
 
 def step(model: HasObjects, belief: Instances, scan: Timed, number: int, knobs: Knobs) -> tuple[Instances, Facts]:
@@ -116,11 +88,12 @@ def step(model: HasObjects, belief: Instances, scan: Timed, number: int, knobs: 
     unseen = model.unseen(scan)
     view = model.view(scan, objects, unseen)
     num, count = len(view.values), len(components.weight)
-    known, new = fit(components, view, slice(count), knobs.gate), fit(unseen, view, slice(count, None), np.inf)
-    own = new.share * (unseen.group[:, None] == np.arange(num))  # near z_j are those of its group
-    kappa = np.maximum(view.clutter + own.sum(0), 1e-100)
-    seen = existence * summed(components, components.weight * view.detection[:count])
-    ratio = existence[:, None] * summed(components, known.share) / kappa
+    known, new = part_of(view, slice(count)), part_of(view, slice(count, None))
+    fresh, rho = given(unseen, new, np.arange(num), np.inf)
+    kappa = np.maximum(view.clutter + rho, 1e-100)
+    seen = existence * summed(components, components.weight * known.detection)
+    share = weights_of(components.offset, components.weight, components.kind, components.covariance, *known, knobs.gate)
+    ratio = existence[:, None] * share / kappa
     missed = np.maximum(1.0 - seen, RARE)
     rows, columns = np.nonzero(ratio)
     offset = np.searchsorted(rows, np.arange(len(label) + 1))
@@ -135,14 +108,15 @@ def step(model: HasObjects, belief: Instances, scan: Timed, number: int, knobs: 
     sure = belief.sure | ((hits >= knobs.hits) & (looks <= knobs.looks))
     hopeless = ~sure & ((looks - hits > knobs.looks - knobs.hits) | (hits == 0))
     keep = ~hopeless & (vain < knobs.misses) & (scan.time - last <= knobs.gone)
-    old = posterior(components, known, view.detection[:count], theta, keep, knobs.least)
-    free = np.setdiff1d(np.flatnonzero(own.sum(0) > 0.0), theta)
-    fresh = begun(unseen, new, free, knobs.least)
+    old, _ = given(components, known, theta, knobs.gate)
+    free = np.setdiff1d(np.flatnonzero(rho > 0.0), theta)
 
     ones = np.ones(len(free), dtype=np.int64)
     after = together(
-        Bernoullis(label[keep], np.ones(keep.sum()), old),
-        Bernoullis(number * lmb.STRIDE + free, np.ones(len(free)), fresh),
+        Bernoullis(label[keep], np.ones(keep.sum()), lighter(old, keep, knobs.least)),
+        Bernoullis(
+            number * lmb.STRIDE + free, np.ones(len(free)), lighter(fresh, np.isin(np.arange(num), free), knobs.least)
+        ),
     )
     hits, looks, vain = (np.append(a[keep], b) for a, b in ((hits, ones), (looks, ones), (vain, 0 * ones)))
     last, sure = np.append(last[keep], scan.time * ones), np.append(sure[keep], ones * knobs.hits <= 1)
@@ -169,32 +143,18 @@ def summed(components: Components, values: Floats) -> Floats:
     return out
 
 
-def posterior(
-    components: Components, known: Fit, detection: Floats, theta: Ints, keep: Any, least: float
-) -> Components:
-    """The instances to keep, each given its measurement or that it has none."""
-    group = components.group
-    j, each = theta[group], np.arange(len(group))
-    weight = components.weight * (1.0 - detection)
-    mean, covariance = components.mean.copy(), components.covariance.copy()
-    hit = j != MISSED
-    weight[hit] = known.share[each[hit], j[hit]]
-    mean[hit], covariance[hit] = known.mean[each[hit], j[hit]], known.covariance[each[hit], j[hit]]
-    total = summed(components, weight)[group]
-    never = total <= RARE * RARE  # missed in spite of p_D = 1: nothing is learnt of which it is
-    weight = np.where(never, components.weight, weight / np.where(never, 1.0, total))
-    return lighter(Components(components.offset, weight, components.kind, mean, covariance), keep, least)
+def part_of(view: View, rows: slice) -> View:
+    """The view of some components."""
+    return view._replace(predicted=view.predicted[rows], slope=view.slope[rows], detection=view.detection[rows])
 
 
-def begun(unseen: Components, new: Fit, free: Ints, least: float) -> Components:
-    """An instance at each measurement that is free."""
-    each, group = np.arange(len(unseen.weight)), unseen.group
-    weight = new.share[each, group]
-    weight = weight / np.maximum(summed(unseen, weight), 1e-300)[group]
-    keep = np.zeros(len(unseen.offset) - 1, dtype=bool)
-    keep[free] = True
-    placed = Components(unseen.offset, weight, unseen.kind, new.mean[each, group], new.covariance[each, group])
-    return lighter(placed, keep, least)
+def given(components: Components, view: View, chosen: Ints, gate: float) -> tuple[Components, Floats]:
+    """The groups (T,), each given its measurement or that it has none, and what that weighs (T,)."""
+    offset, weight, kind, mean, covariance = components
+    own = Components(offset, weight.copy(), kind, mean.copy(), covariance.copy())
+    factor = see(*own, chosen, *view, gate)
+    never = (factor <= RARE * RARE)[own.group]  # missed in spite of p_D = 1: nothing is learnt of which it is
+    return own._replace(weight=np.where(never, weight, own.weight)), factor
 
 
 def lighter(components: Components, keep: Any, least: float) -> Components:

@@ -181,7 +181,8 @@ def emit(formula: Formula, *, jacobian: bool) -> str:
     for i in range(f.n_instructions()):
         code, inputs, out = f.instruction_id(i), f.instruction_input(i), f.instruction_output(i)
         if code == casadi.OP_CONST:
-            body.append(f"w{out[0]} = {float(f.instruction_constant(i))!r}")
+            value = repr(float(f.instruction_constant(i)))
+            body.append(f"w{out[0]} = " + value.replace("inf", "math.inf").replace("nan", "math.nan"))
         elif code == casadi.OP_INPUT:
             body.append(f"w{out[0]} = " + (f"x[i, {inputs[1]}]" if inputs[0] == 0 else f"p[i * own, {inputs[1]}]"))
         elif code == casadi.OP_OUTPUT:

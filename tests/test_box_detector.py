@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from models.multi_object import Bernoullis, Components, no_components
 from models.objects.box_detector import BoxDetector, ImageBox
 from models.objects.motion import ConstantTurn, ConstantVelocity, Motion
 from models.objects.scans import Recording, Scan
-from models.objects.scene import scan_set, simulate_scan
+from models.objects.scene import rows_of, scan_set, simulate_scan
 from models.objects.sensors import Sensor, sensor_formulas, spread_formula
 from models.objects.traffic import Kind, Traffic
+from models.program import quiet_doubles
 
 BOX = ("z", "height", "width", "length")
 TURN, VELOCITY = ConstantTurn(BOX, accelerates=False), ConstantVelocity(("heading", *BOX))
@@ -86,6 +88,25 @@ def test_false_alarms_of_boxes_add_up_to_their_density_times_the_area_in_view() 
     weight = LASER.clutter_intensity(z) / shape * np.prod(high - low)
     area = 0.5 * 70.0**2 * 1.4
     assert weight.mean() == pytest.approx(LASER.clutter_density * area, abs=4 * weight.std() / math.sqrt(num))
+    assert LASER.false_alarms == pytest.approx(LASER.clutter_density * area, rel=1e-12)
+
+
+def test_simulated_false_alarms_of_boxes_are_uniform_on_the_ground() -> None:
+    """As many as the density expects, which then is that of the set: log p of an empty scan of nobody is minus it."""
+    model, nobody = Traffic((replace(LASER, clutter_density=0.05),), TURN, (KIND,)), np.zeros((0, len(TURN.names)))
+    scan, source = simulate_scan(model, "laser", 0.0, POSE, np.zeros(0, np.int64), nobody, 1)
+    expected = 0.05 * 0.7 * 70.0**2
+    num, z = len(source), scan.values
+    assert abs(num - expected) < 4 * math.sqrt(expected)
+    assert abs(np.square(z[:, 0]).mean() - 70.0**2 / 2) < 4 * 70.0**2 / math.sqrt(12 * num)
+    loc, std = np.array(LASER.clutter_shape).T
+    assert (np.abs(z[:, 3:].mean(0) - loc) < 4 * std / math.sqrt(num)).all()
+    assert (np.abs(z[:, 3:].std(0) / std - 1.0) < 4 / math.sqrt(2 * num)).all()
+    none = torch.zeros(0, dtype=torch.long), torch.from_numpy(nobody), torch.zeros(0)
+    empty = scan._replace(values=z[:0])
+    with quiet_doubles():
+        found = scan_set(model, empty, *none).log_prob(rows_of(model, empty))
+    assert float(found) == pytest.approx(-expected, rel=1e-12)
 
 
 def test_an_image_box_is_the_hull_of_the_four_corners() -> None:
@@ -97,6 +118,14 @@ def test_an_image_box_is_the_hull_of_the_four_corners() -> None:
     found = measure(x, np.zeros((1, 3)))
     np.testing.assert_allclose(found[0], [math.atan2(0.8, 18.0), -math.atan2(0.8, 18.0), 1.5 / 18.0], rtol=1e-12)
     np.testing.assert_allclose(found[1], [math.atan2(5.0, 19.2), math.atan2(1.0, 20.8), 1.5 / 19.2], rtol=1e-12)
+
+
+def test_corners_behind_the_camera_are_at_its_plane() -> None:
+    """A car beside the camera, half of it passed: it reaches the border of what can be seen, and errors stay finite."""
+    measure, _ = sensor_formulas(TURN, ImageBox, len(IMAGE.settings))
+    x = np.array([[1.0, 3.0, 0.0, 0.0, 0.0, 0.0, 1.5, 1.6, 4.0]])
+    found = measure(x, np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(found, [math.atan2(3.8, 0.3), math.atan2(2.2, 3.0), 1.5 / 0.3], rtol=1e-12)
 
 
 def test_detection_ends_softly_at_the_border_of_the_image_and_far_away() -> None:

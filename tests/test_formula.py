@@ -103,6 +103,14 @@ def test_where_does_not_pass_on_the_nan_of_the_side_not_taken() -> None:
     np.testing.assert_allclose(formula.torch(torch.from_numpy(points), torch.zeros(0)).numpy(), y)
 
 
+def test_constants_need_not_be_finite() -> None:
+    def function(x: Any, p: Any, ops: Any) -> Any:
+        return ops.where(x[0] > 0.0, x[0], math.inf), ops.where(x[0] > 0.0, -math.inf, 1.0), math.nan
+
+    found = Formula("without_end", function, 1)(np.array([[-2.0], [2.0]]), np.zeros((1, 0)))
+    np.testing.assert_array_equal(found, [[math.inf, 1.0, math.nan], [2.0, -math.inf, math.nan]])
+
+
 def test_torch_broadcasts_parameters() -> None:
     formula = Formula("product", lambda x, p, ops: (x[0] * p[0], 1.0), 1, 1)
     found = formula.torch(torch.ones(3, 1, 1, dtype=torch.float64), torch.ones(4, 1, dtype=torch.float64))

@@ -209,3 +209,10 @@ def test_detection_that_changes_over_the_noise_of_a_step_is_weighed_state_by_sta
     assert math.exp(facts.log_factor) == pytest.approx(expected, rel=4 / math.sqrt(num))
     there = weight @ (survival * (1.0 - detection)) / weight.sum() / expected
     assert joint_particles.tell(belief, 0.0, model.period, 1).existence[0] == pytest.approx(there, abs=0.02)
+
+
+def test_empty_scans_of_nobody_are_scans() -> None:
+    found = joint_particles.run(small(), scans_of([], [], [[1.0, 2.0]]), num_particles=1000)
+    alone = lmb.run(small(), scans_of([], [], [[1.0, 2.0]])).existence
+    assert np.diff(found.offset).tolist() == [0, 0, 1]
+    assert found.existence == pytest.approx(alone, abs=4 * 0.5 / math.sqrt(1000))

@@ -9,7 +9,8 @@ import pytest
 from scipy.special import expit
 
 from benchmarks import kitti_tracking as benchmark
-from experiments.kitti_existence import Past, candidates, fit, past_of, told
+from experiments.kitti_existence import Past, _crowded, candidates, fit, past_of, told
+from experiments.kitti_matching import TrackBoxes
 from experiments.kitti_metrics import paths_of
 from experiments.scenarios.kitti_scans import CAMERA, LASER, scans_of
 from experiments.scenarios.kitti_tracking import CameraBoxes, Detections
@@ -39,6 +40,23 @@ def tracks_of(rows: list[tuple[int, int, int]], sensor: tuple[str, ...], time: n
         sensor=sensor,
         measurement=measurement,
     )
+
+
+def test_weights_are_at_the_maximum_with_its_penalty() -> None:
+    """The slope of sum log p(y | a) - |w|^2 / 2 is zero."""
+    rng = np.random.default_rng(0)
+    features = rng.standard_normal((60, 3)) * [1.0, 10.0, 0.1] + [0.0, 5.0, 1.0]
+    y = rng.random(60) < expit(features[:, 0])
+    found = fit(features, y)
+    A = np.clip((features - features.mean(0)) / features.std(0), -3.0, 3.0)
+    slope = np.concatenate([np.ones((60, 1)), A], 1).T @ (y - found.probability(features)) - found.weights
+    np.testing.assert_allclose(slope, 0.0, atol=1e-9)
+
+
+def test_who_is_near_a_surer_one_is_crowded() -> None:
+    position = np.array([[0.0, 0.0], [1.0, 0.0], [9.0, 0.0], [1.0, 0.0]])  # the last is of another frame
+    boxes = TrackBoxes(np.array([0, 3, 4]), np.arange(4), np.zeros((4, 7)), np.array([0.9, 0.8, 0.1, 0.1]))
+    assert _crowded(boxes, position).tolist() == [0.0, 1.0, 0.0, 0.0]
 
 
 def test_histories_are_those_of_each_object_and_each_sensor() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks import kitti_folds as benchmark
+from benchmarks.configured import made
 from benchmarks.kitti_folds import GRID, Settings, Trial, attempt, choose, described
-from benchmarks.kitti_tracking import configured
 from experiments import kitti_folds, kitti_metrics
 from experiments.kitti_boxes import image_boxes
 from experiments.kitti_evaluation import count_all
@@ -95,7 +95,7 @@ def test_each_sequence_has_the_settings_that_serve_the_others_best() -> None:
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_the_filter_runs_with_the_settings_that_are_tried(camera: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, _ = configured("kitti_tracking_camera" if camera else "kitti_tracking")
+    (model,) = made([f"experiment={'kitti_tracking_camera' if camera else 'kitti_tracking'}"], "model")
     assert all(getattr(START, name) in values for name, values in GRID.items())
     assert (model.sensors[0].clutter_density, model.sensors[0].occlusion) == START[:2]
     runs = []

@@ -189,6 +189,14 @@ def test_how_large_it_is_tells_a_car_from_a_pedestrian(size: tuple[float, float]
         assert share[kind] > 0.99
 
 
+@pytest.mark.parametrize("angle", [0.5, 2.0, 3.6652, 5.0, 2 * math.pi])
+def test_false_alarms_are_in_the_smallest_rectangle_about_the_view(angle: float) -> None:
+    sensor, bearing = replace(SENSOR, angle=angle), np.linspace(-angle / 2, angle / 2, 100_001)
+    far = sensor.reach[1] * np.array([np.cos(bearing), np.sin(bearing)])
+    view = np.stack([np.minimum(far.min(1), 0.0), np.maximum(far.max(1), 0.0)], 1)
+    np.testing.assert_allclose(sensor.span[:2], view, atol=1e-6 * sensor.reach[1])
+
+
 def test_showing_less_makes_no_false_alarm_of_an_object() -> None:
     """The intensity of first measurements where a size is unseen is that of the other sizes, UNSEEN whatever it is."""
     seen = look((30.0, 0.0, 0.0, 4.5, 1.8))
@@ -200,6 +208,9 @@ def test_showing_less_makes_no_false_alarm_of_an_object() -> None:
     plain_feature = super(LaserOutline, SENSOR).feature(scan, 1)
     ratio = SENSOR.feature(scan, 1) / plain_feature
     assert ratio[0, 0] == pytest.approx(math.sqrt(2 * math.pi) * UNSEEN / SENSOR.largest)
+    neither = scan._replace(noise=np.eye(5)[None] + UNSEEN**2 * np.diag([0.0, 0.0, 1.0, 0.0, 1.0]))  # a lone point
+    assert SENSOR.feature(neither, 1)[0, 0] == pytest.approx(ratio[0, 0] ** 2)
+    assert SENSOR.feature(scan._replace(noise=np.eye(5)[None]), 1)[0, 0] == 1.0
 
 
 def test_outlines_beat_the_middles_of_boxes_on_the_same_scans() -> None:

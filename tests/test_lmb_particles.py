@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from inference import lmb, lmb_particles
 from inference.object_particles import draw, log_corrections, moments, widen
 from inference.tracks import Tracks
-from models.multi_object import no_objects
+from models.multi_object import Bernoullis, Components, no_objects
 from models.objects.motion import ConstantTurn, ConstantVelocity
 from models.objects.scans import Recording, Scan
 from models.objects.scene import simulate_scan
@@ -61,6 +61,49 @@ def test_one_object_that_is_always_detected_is_filtered_as_by_kalman() -> None:
         error = np.abs(found.covariance[0] - P) / np.outer(sd, sd)
         assert np.all(error < 5 * math.sqrt(2 * count / num))
     assert found.existence[0] > 0.999
+
+
+def test_long_gaps_have_the_noise_of_all_their_steps() -> None:
+    """All but that of the last step is drawn; together they are Q of the whole gap."""
+    model, num, dt = plots(), 20_000, 1.5
+    none, zero = np.zeros(num, dtype=np.int64), np.zeros((num, 4))
+    state, survival, rest = lmb_particles.moved_on(model, none, zero, dt, np.random.default_rng(0))
+    Q = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+    std = np.sqrt(np.diag(Q))
+    error = np.cov(state.T) + rest[0] - Q
+    assert np.all(np.abs(error) < 5 * np.outer(std, std) * math.sqrt(2 / num))
+    np.testing.assert_allclose(survival, math.exp(-dt / model.kinds[0].lifetime), rtol=1e-12)
+
+
+def test_kernels_are_those_of_families() -> None:
+    """Two headings of one object, far apart: particles are drawn to the middle of their own, and keep its width."""
+    rng, num = np.random.default_rng(0), 500
+    state = rng.standard_normal((1, num, 2))
+    family = (np.arange(num) % 2)[None]
+    state[0, :, 0] += 1000.0 * family[0]
+    none = np.zeros((1, num), dtype=np.int64)
+    even = np.full((1, num), 1.0 / num)
+    belief = lmb_particles.Clouds(0.0, none[:, 0], np.ones(1), even, none, state, family)
+    found = lmb_particles.regularise(belief, np.zeros((num, 2, 2)), np.full(2, np.inf), 0.5).components
+    for k in (0, 1):
+        own, before = found.mean[family[0] == k], state[0, family[0] == k]
+        V = np.cov(before.T, bias=True)
+        np.testing.assert_allclose(own.mean(0), before.mean(0), atol=1e-9)
+        np.testing.assert_allclose(np.cov(own.T, bias=True), 0.75 * V, atol=1e-9)
+        np.testing.assert_allclose(found.covariance[family[0] == k], np.tile(0.25 * V, (num // 2, 1, 1)), atol=1e-9)
+
+
+def test_further_states_are_hidden_by_the_heaviest_component_of_an_object() -> None:
+    sensor = RangeBearing(name="radar", noise_std=(0.5, 0.02), occlusion=1.0)
+    model = Traffic((sensor,), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),))
+    mean, none = np.array([[0.0, 40.0, 0.0, 0.0], [20.0, 0.0, 0.0, 0.0]]), np.zeros(2, dtype=np.int64)
+    parts = Components(np.array([0, 2]), np.array([0.2, 0.8]), none, mean, np.tile(np.eye(4), (2, 1, 1)))
+    objects, scan = Bernoullis(none[:1], np.array([0.9]), parts), Scan("radar", 0.0, np.zeros((0, 2)), POSE)
+    behind = np.array([[60.0, 0.0, 0.0, 0.0], [0.0, 60.0, 0.0, 0.0]])
+    _, found = lmb_particles.look(model, scan, objects, none, behind)
+    more = Components(np.array([0, 2]), np.full(2, 0.5), none, behind, np.tile(np.eye(4), (2, 1, 1)))
+    np.testing.assert_allclose(found, model.view(scan, objects, more).detection[2:], rtol=1e-12)
+    assert found[0] < 0.75 * found[1]
 
 
 def crossing(model: Traffic, count: int) -> list[Scan]:
@@ -263,3 +306,11 @@ def test_settings_out_of_range_are_refused() -> None:
         lmb_particles.run(plots(), crossing(plots(), 1), kernel=1.5)
     with pytest.raises(InputError, match="lmb_particles needs a model of many objects"):
         lmb_particles.run(object(), [])  # type: ignore[arg-type]
+
+
+def test_empty_scans_of_nobody_are_scans() -> None:
+    scans = [Scan("plots", 0.1 * t, np.zeros((0, 2)), POSE) for t in range(3)]
+    scans.append(Scan("plots", 0.3, np.array([[1.0, 2.0]]), POSE))
+    found = lmb_particles.run(plots(), scans, num_particles=50)
+    assert np.diff(found.offset).tolist() == [0, 0, 0, 1]
+    assert found.existence == pytest.approx(lmb.run(plots(), scans).existence, rel=1e-9)

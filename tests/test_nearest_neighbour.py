@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -127,3 +128,18 @@ def test_evidence_is_that_of_the_association_chosen() -> None:
     z = np.ones(2)
     hit = -0.5 * z @ np.linalg.solve(S, z) - 0.5 * np.log(np.linalg.det(2 * np.pi * S)) + np.log(0.9)
     assert found == pytest.approx(np.log(kappa) + hit, abs=1e-3)
+
+
+def test_memory_is_that_of_a_table_of_objects_and_measurements() -> None:
+    """Many false alarms, each of which begins an object: no more than numbers are kept of a pair (measured: 4 of 8
+    bytes), no states."""
+    rng, num = np.random.default_rng(0), 1000
+    model = replace(MODEL, sensors=(replace(PLOTS, detection=0.9, clutter=float(num)),))
+    scans = plots(*(list(map(tuple, rng.uniform(-1000.0, 1000.0, (num, 2)))) for _ in range(2)), period=0.1)
+    run(model, plots([(0.0, 0.0)], [(0.0, 0.0)]))  # compiles
+    tracemalloc.start()
+    found = run(model, scans, hits=1, looks=1)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert np.diff(found.offset)[0] == num
+    assert peak < 20 * 8 * num**2

@@ -79,6 +79,8 @@ def test_what_stands_behind_is_hidden() -> None:
     assert share((0.0, -40.0), (0.1, 20.0)) == 0.0  # nor what is on the other side
     half = 40.0 * math.tan(math.atan(1.0 / 20.0))  # the edge of the nearer one goes through the middle of the other
     assert share((40.0, half), (20.0, 0.0)) == pytest.approx(0.5, abs=2e-3)
+    behind = (20.0 + 1.5, 0.0)  # as far behind the other as that is wide: half of it is taken to be behind
+    assert share(behind, (20.0, 0.0), other_radius=1.5) == pytest.approx(0.5, abs=1e-6)
     # a thin post hides the share of the angle that it takes
     thin = math.atan(0.1 / 20.0) / math.atan(1.0 / 40.0)
     assert share((40.0, 0.0), (20.0, 0.0), other_radius=0.1) == pytest.approx(thin)

@@ -11,12 +11,13 @@ import pyro
 import pytest
 import torch
 from numpy.typing import NDArray
-from scipy.stats import truncnorm
+from scipy.stats import poisson, truncnorm
 from torch import Tensor
 
+from models.multi_object import Components, no_objects
 from models.objects.ground import Grid
 from models.objects.motion import ConstantVelocity
-from models.objects.scan_set import FalseAlarms, ScanSet, log_sum_associations
+from models.objects.scan_set import FalseAlarms, ScanSet, capacity, log_sum_associations
 from models.objects.scans import Recording, Scan
 from models.objects.scene import Newcomers, ScanFrame, rows_of, scan_set, simulate_scan
 from models.objects.sensors import Position, Radar
@@ -123,6 +124,57 @@ def test_rows_that_are_not_there_count_nothing() -> None:
     for other in (padded, between):
         assert float(seen.log_prob(other)) == pytest.approx(float(seen.log_prob(value)), abs=1e-12)
     assert float(seen.log_prob_of(padded, torch.tensor([3, -1]))) == -math.inf
+
+
+def test_rows_that_are_not_there_may_hold_anything() -> None:
+    seen, value = on_a_line([0.8, 0.6]), rows(torch.tensor([2.1, 8.0], dtype=torch.float64))
+    nan = torch.tensor([[0.0, math.nan, math.nan]]).double()
+    slopes = []
+    for given in (value, torch.cat([nan, value])):
+        place = seen.predicted.clone().requires_grad_(True)
+        rest = (seen.noise, seen.detection, seen.kind, seen.false_alarms, seen.clutter, seen.period, 1)
+        found = ScanSet(place, *rest).log_prob(given)
+        assert found.item() == pytest.approx(float(seen.log_prob(value)), abs=1e-12)
+        slopes.append(torch.autograd.grad(found, place)[0])
+    torch.testing.assert_close(slopes[1], slopes[0], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("expected", [0.0, 0.1, 1.0, 3.0, 10.0, 100.0, 1000.0])
+def test_scans_have_room_for_all_false_alarms_but_once_in_a_million_million(expected: float) -> None:
+    assert poisson.sf(capacity(0, expected), expected) < 1e-12
+    assert capacity(7, expected) == 7 + capacity(0, expected)
+
+
+def test_bearings_have_no_end() -> None:
+    """Behind the sensor they jump, and a turn more is the same measurement."""
+    state = torch.tensor([[-50.0, 0.2, 0.0, 5.0, 0.0, 0.0]]).double()
+    scan = Scan("radar", 0.0, np.zeros((0, 3)), np.zeros(3))
+    with quiet_doubles():
+        seen = scan_set(MODEL, scan, torch.tensor([0]), state, torch.ones(1))
+        bearings = [math.pi - 0.01, -math.pi - 0.01, 3 * math.pi - 0.01]
+        found = [float(seen.log_prob_of(_radar(b), torch.tensor([0]))) for b in bearings]
+    assert found == pytest.approx([found[0]] * 3, abs=1e-9)
+    assert found[0] > -10.0  # and near: a residual of a turn weighs e^-49000
+
+
+def _radar(bearing: float) -> Tensor:
+    return torch.tensor([[1.0, 50.0, bearing, -5.0, 1.0, 1.0]]).double()
+
+
+def test_kinds_that_sensors_hardly_see_are_seen_as_often_as_filters_think() -> None:
+    kinds = (replace(KINDS[0], visibility=0.5), KINDS[1])
+    plots = replace(SENSORS[1], confusion=None)
+    model, faint = (Traffic((plots,), kinds=k) for k in (KINDS, kinds))
+    state = np.tile([10.0, 10.0, 0.0, 5.0, 0.0, 0.0], (2, 1))
+    scan, kind = Scan("plots", 0.0, np.zeros((0, 2)), np.zeros(3)), np.array([0, 1])
+    parts = Components(np.array([0, 2]), np.full(2, 0.5), kind, state, np.tile(np.eye(6), (2, 1, 1)))
+    with quiet_doubles():
+        found = [
+            scan_set(m, scan, torch.from_numpy(kind), torch.from_numpy(state), torch.ones(2)).detection.numpy()
+            for m in (model, faint)
+        ]
+    np.testing.assert_allclose(found[1], found[0] * [0.5, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(faint.view(scan, no_objects(6), parts).detection, found[1], rtol=1e-9)
 
 
 def test_what_is_certain_has_a_density() -> None:
@@ -256,7 +308,11 @@ def test_objects_that_come_fill_free_slots_in_order() -> None:
         torch.manual_seed(3)
         with pyro.plate("_batch", 50, dim=-1):
             state = model.initial(BLANK[1])
-            later = model.transition(state, BLANK[1]._replace(seconds=1.0))
+            trace = pyro.poutine.trace(lambda: model.transition(state, BLANK[1]._replace(seconds=1.0))).get_trace()
+            later = trace.nodes["_RETURN"]["value"]
+    born, stay = trace.nodes["born"], state["exists"] * trace.nodes["stays"]["value"]
+    assert bool((born["value"] == 4 - stay.sum(-1)).all())  # as many as find room, whatever their number
+    assert bool((born["fn"].log_prob(born["value"]).abs() < 1e-3).all())
     assert bool((later["exists"].sum(-1) == 4).all())  # more would have come: Poisson, truncated
     first = state["exists"]
     assert bool((first[:, :-1] >= first[:, 1:]).all())

@@ -280,7 +280,7 @@ EYE = np.broadcast_to(np.eye(2), (2, 2, 2))
         ({"time": -1.0}, "time -1"),
         ({"values": np.array([[30.0, math.nan], [20.0, 0.2]])}, r"'laser' at 1.5 s has nan in its values.*\[0, 1\]"),
         ({"values": np.zeros((2, 3))}, r"values of \(range, bearing\) of shape \(2, 3\); give \(2, 2\)"),
-        ({"pose": np.array([0.0, math.inf, 0.0])}, "inf in its pose"),
+        ({"pose": np.array([0.0, math.inf, 0.0])}, r"inf in its pose.*give where the car was"),
         ({"noise": EYE[:1]}, r"covariances of shape \(1, 2, 2\)"),
         ({"noise": EYE * [[[1.0]], [[-1.0]]]}, "not symmetric and positive definite, of measurement 1"),
         ({"noise": EYE + np.array([[0.0, 0.3], [0.0, 0.0]])}, "not symmetric and positive definite, of measurement 0"),
@@ -305,3 +305,33 @@ def test_empty_and_huge_scans_are_scans() -> None:
     assert [len(scan.values) for scan in model.check([empty, huge])] == [0, 5000]
     frames = model.prepare(Recording((SCAN, empty)))
     assert [scan.time for scan in model.check(frames)] == [1.5, 1.5]
+
+
+def test_a_mount_turns_with_the_car() -> None:
+    """One metre ahead and two to the left, on a car that looks along (.6, .8)."""
+    pose = np.array([10.0, 20.0, math.atan2(0.8, 0.6)])
+    np.testing.assert_allclose(mounted(pose, (1.0, 2.0, 0.3)), [9.0, 22.0, pose[2] + 0.3], atol=1e-12)
+
+
+def test_range_rates_are_the_slope_of_the_range() -> None:
+    radar = Radar(name="radar", noise_std=(0.3, 0.02, 0.2))
+    model = Traffic((radar,), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),))
+    measure, _ = model.formulas(radar)
+    x, at = np.array([[30.0, 20.0, -3.0, 5.0]]), np.array([[1.0, 2.0, 0.4]])
+    step = 1e-4 * np.array([[-3.0, 5.0, 0.0, 0.0]])
+    slope = (measure(x + step, at)[0, 0] - measure(x - step, at)[0, 0]) / 2e-4
+    assert measure(x, at)[0, 2] == pytest.approx(slope, abs=1e-7)
+
+
+def test_what_is_too_near_is_not_seen() -> None:
+    radar = RangeBearing(name="radar", noise_std=(0.3, 0.02), reach=(10.0, 100.0), detection=0.9)
+    _, detect = Traffic((radar,), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),)).formulas(radar)
+    x = np.array([[5.0, 0.0, 0.0, 0.0], [10.0, 0.0, 0.0, 0.0], [20.0, 0.0, 0.0, 0.0]])
+    found = detect(x, np.array([[0.0, 0.0, 0.0, *radar.settings, 0.0]]))[:, 0]
+    np.testing.assert_allclose(found, [0.0, 0.45, 0.9], atol=1e-4)
+
+
+def test_scores_are_odds() -> None:
+    plots = Position(name="plots", noise_std=(1.0, 1.0))
+    scan = Scan("plots", 0.0, np.zeros((3, 2)), np.zeros(3), score=np.array([0.0, 0.5, 0.75]))
+    np.testing.assert_allclose(plots.feature(scan, 2), np.array([[0.0], [1.0], [3.0]]) * np.ones(2), rtol=1e-12)

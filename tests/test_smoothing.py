@@ -123,6 +123,44 @@ def turning(seed: int) -> tuple[Traffic, np.ndarray, list[Scan]]:
     return model, np.array(states), scans
 
 
+def test_turns_are_smoothed_to_the_minimum_of_the_squares() -> None:
+    """Of a heading that is not the first of those that it may have; noise as it is at the states found."""
+    sensor = RangeBearing(name="radar", noise_std=(0.3, 0.02), detection=0.9, clutter=1.0)
+    kind = Kind(noise=(1.0, 0.5, 0.05), lifetime=1e3, speed=(8.0, 2.0))
+    model, angle = Traffic((sensor,), ConstantTurn(), (kind,)), np.pi + 0.5 * np.arange(0.0, 2.41, 0.4)
+    place = np.array([5.0, 10.0]) + 10.0 * np.stack([np.sin(angle), -np.cos(angle)], -1)  # at 5 m/s, counterclockwise
+    noise = np.random.default_rng(0).standard_normal(place.shape) * [0.3, 0.02]
+    z = np.stack([np.hypot(*place.T), np.arctan2(*place.T[::-1])], -1) + noise
+    window = window_of(model, [Scan("radar", 0.4 * t, z[t : t + 1], np.zeros(3)) for t in range(len(z))])
+    track = tuple(range(len(z)))
+    (trail,) = follow(model, window, [track], [None], gate=math.inf)
+    best = int(trail.rows[-1].weight.argmax())
+    assert best > 0
+    found = smooth(model, window, track, max_iterations=100, tolerance=1e-9)
+    assert found.converged
+    prior, none = window.prior[0], np.zeros(len(z) - 1, dtype=np.int64)
+    moved = model.move(none, found.mean[:-1], 0.4)
+    factor = np.linalg.cholesky(moved.noise @ moved.noise.swapaxes(1, 2))
+    root = np.linalg.cholesky(prior.covariance[best])
+
+    def residuals(flat: np.ndarray) -> np.ndarray:
+        x = flat.reshape(len(z), 6)
+        off = x[1:] - model.move(none, np.ascontiguousarray(x[:-1]), 0.4).mean
+        bearing = z[:, 1] - np.arctan2(x[:, 1], x[:, 0])
+        return np.concatenate(
+            [
+                np.linalg.solve(root, x[0] - prior.mean[best]),
+                np.linalg.solve(factor, off[..., None]).ravel(),
+                (z[:, 0] - np.hypot(x[:, 0], x[:, 1])) / 0.3,
+                (bearing - 2 * np.pi * np.round(bearing / (2 * np.pi))) / 0.02,
+            ]
+        )
+
+    least = least_squares(residuals, found.mean.ravel(), xtol=1e-14, ftol=1e-14, gtol=1e-14).x.reshape(len(z), 6)
+    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    assert (np.abs(found.mean - least) / std).max() < 1e-3
+
+
 def test_smoothed_positions_are_nearer_to_the_truth_than_filtered_ones() -> None:
     filtered, smoothed, nees = [], [], []
     for seed in range(8):
@@ -171,6 +209,14 @@ def test_the_engine_smooths_what_the_filter_confirms() -> None:
     rough, fine = (metrics(tracks, scene)["position_error_m"] for tracks in (before, after))
     assert fine < 0.85 * rough  # .77: where neighbours are mistaken, smoothing mistakes them, too
     assert after.info["smoothed"] == 3
+    window = window_of(model, frames)
+    found = associate(model, window.scans, lmb.Knobs(), threshold=0.5, report=0.01, progress=False).measurements
+    for label, own in found.items():  # from its first measurement on
+        track = tuple(int(window.offset[s]) + j for s, j in own)
+        rows = np.flatnonzero((after.label == label) & (after.scan >= own[0][0]))
+        path = smooth(model, window, track)
+        np.testing.assert_array_equal(after.mean[rows], path.mean[after.scan[rows] - own[0][0]])
+        np.testing.assert_array_equal(after.covariance[rows], path.covariance[after.scan[rows] - own[0][0]])
     again = smoothing.run(model, frames[::-1])
     np.testing.assert_array_equal(again.mean, after.mean)
 

@@ -114,6 +114,18 @@ def test_the_probabilities_of_draws_sum_to_one_and_are_those_drawn() -> None:
             assert stats.chisquare(found, num * p).pvalue > 1e-4
 
 
+def test_near_partners_are_later_and_earlier_ones() -> None:
+    """B(h | g) ~ N(h | g) + N(g | h), of what is informed about both."""
+    model = small_model()
+    later, near, _ = proposals(model, window_of(model, small_scans()), reach=5)
+    num = len(later.offset) - 1
+    N, B = np.zeros((2, num, num))
+    for table, by in ((N, later), (B, near)):
+        table[np.repeat(np.arange(num), np.diff(by.offset)), by.choice] = by.share
+    both = N + N.T
+    np.testing.assert_allclose(B, both / both.sum(1, keepdims=True), atol=1e-12)
+
+
 def test_a_ratio_left_out_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     true = track_moves.relink
 
@@ -276,3 +288,26 @@ def test_numbers_out_of_range_are_refused_in_words(knobs: dict[str, Any], messag
 def test_another_model_is_refused_in_words() -> None:
     with pytest.raises(InputError, match="track_mcmc needs a model of many objects"):
         track_mcmc.run(object(), small_scans(), seed=0)  # type: ignore[arg-type]
+
+
+def test_the_best_partition_is_told() -> None:
+    model = small_model(ONE_KIND)
+    scans = small_scans()
+    window = window_of(model, scans)
+    exact = posterior(model, window)
+    best = max(exact, key=lambda tracks: exact[tracks])
+    found = track_mcmc.run(model, scans, seed=0, start="nothing", num_chains=2, num_steps=1000, warmup=100)
+    track = np.full(len(window.scan), -1)
+    for rank, own in enumerate(best):
+        track[list(own)] = rank
+    assert found.estimate["track"].tolist() == track.tolist()
+
+
+def test_objects_are_counted_as_probably_as_they_are_there() -> None:
+    model, rng = small_model(ONE_KIND), np.random.default_rng(0)
+    window = window_of(model, small_scans())
+    library = Library(model, window, np.inf)
+    library.learn([((0,), ()), ((1,), ())])
+    found = np.mean([track_mcmc._count(window, library, ((0,), (1,)), rng) for _ in range(4000)], 0)
+    alive = sum(np.pad(library.weights[g,].alive, (0, 3))[:3] for g in (0, 1))
+    np.testing.assert_allclose(found, alive, atol=4 * np.sqrt(2 * 0.25 / 4000))

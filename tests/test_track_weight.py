@@ -146,3 +146,12 @@ def test_beyond_the_gate_a_track_is_impossible() -> None:
     assert near.log_weight == -math.inf
     with pytest.raises(InputError, match="at least one scan"):
         window_of(model, ())
+
+
+def test_who_is_surely_gone_stays_gone() -> None:
+    """After 400 s at most e^-44 of an object is left, less than is followed: no later scan says more."""
+    scans = list(small_scans((1, 0, 0, 0)))
+    scans[2:] = [scan._replace(time=scan.time + 400.0) for scan in scans[2:]]
+    window = window_of(small_model(), scans)
+    (trail,) = follow(small_model(), window, [(0,)], [None], gate=np.inf)
+    assert len(trail.alive) == 2 and trail.alive[0] == 1.0 and 0.0 < trail.alive[1] < 1.0

@@ -156,17 +156,22 @@ def test_late_scans_change_nothing_of_what_is_believed_in_the_end() -> None:
 
 
 def test_late_scans_do_not_change_labels() -> None:
-    """The objects that are confirmed before a scan comes late are called the same after it."""
+    """All that is told of before a scan comes late, however improbable, is called the same after it, and has the state
+    that it would have had in time; only what the late scan may have shown first is new. Labels are told as numbers
+    counted up by arrival, so those of the last five scans are other ones in time."""
     scans = drive()
-    late = [*scans[:20], *scans[21:25], scans[20], *scans[25:]]
-    found, without = lmb.run(MODEL, late), lmb.run(MODEL, [*scans[:20], *scans[21:]])
-    before, after = found.at(23), found.at(24)
+    late = [*scans[:20], *scans[21:25], scans[20]]
+    found = lmb.run(MODEL, late, report=0.0, faint=1e-12)
+    before, after, kept = found.at(23), found.at(24), found.at(19).label
     assert found.time[23] == found.time[24]
     assert found.info["late"] == 1
-    sure = before.label[before.existence > 0.5]
-    assert len(sure) >= 2
-    assert set(sure) <= set(after.label[after.existence > 0.5])
-    np.testing.assert_array_equal(before.label, without.at(23).label)
+    assert len(kept) > 20 and set(kept) <= set(before.label) <= set(after.label)
+    new = np.setdiff1d(after.label, before.label)
+    assert new.tolist() == [before.label.max() + 1 + j for j in range(len(scans[20].values))] != []
+    in_time = lmb.run(MODEL, scans[:25], report=0.0, faint=1e-12).at(24)
+    np.testing.assert_allclose(after.mean, in_time.mean, rtol=1e-12)
+    old = np.isin(after.label, kept)
+    np.testing.assert_array_equal(after.label[old], in_time.label[old])
 
 
 def test_labels_are_unique_and_never_given_again() -> None:

@@ -110,6 +110,8 @@ def test_order_of_rows_and_names_of_objects_change_nothing() -> None:
 def test_scans_find_their_times_in_the_truth() -> None:
     truth = traffic()
     assert times_of(truth, truth.time[[0, 3, 3, 19]]).tolist() == [0, 3, 3, 19]
+    for slightly in (-5e-7, 5e-7):
+        assert times_of(truth, truth.time[[0, 3, 19]] + slightly).tolist() == [0, 3, 19]
     tracks = believed(truth)
     with pytest.raises(InputError, match=r"the truth knows no traffic at 0\.25 s, when scan 0 was taken"):
         judge(replace(tracks, time=tracks.time + 0.25), truth, cutoff=10.0)

@@ -54,7 +54,7 @@ class BoxDetector(BoxSensor):
     """Range [m] and bearing [rad] of the middle of a box, the axis it lies along (front and back are not told apart
     [rad]), height z of its lower side in the world, its height, width and length [m].
 
-    clutter_density  false alarms are uniform in the view, so many to the square metre
+    clutter_density  false alarms are uniform in the view, so many to the square metre (`clutter` is not read)
     clutter_shape    (4, 2) mean and standard deviation of their z, height, width and length, which are normal"""
 
     clutter_density: float = 2.7e-4
@@ -77,6 +77,20 @@ class BoxDetector(BoxSensor):
         half = min(self.angle / 2, math.pi)
         around = [self.reach, (-half, half), (-math.pi / 2, math.pi / 2)]
         return np.vstack([around, np.stack([loc - 3 * std, loc + 3 * std], 1)])
+
+    @property
+    def false_alarms(self) -> float:
+        (near, far), half = self.reach, min(self.angle / 2, math.pi)
+        return self.clutter_density * half * (far**2 - near**2)
+
+    def clutter_quantile(self, uniform: Floats) -> Floats:
+        from scipy.special import ndtri
+
+        found, (near, far) = super().clutter_quantile(uniform), self.reach
+        loc, std = np.array(self.clutter_shape).T
+        found[..., 0] = np.sqrt(near**2 + (far**2 - near**2) * uniform[..., 0])
+        found[..., 3:] = loc + std * ndtri(uniform[..., 3:])
+        return found
 
     def clutter_intensity(self, values: Floats) -> Floats:
         loc, std = np.array(self.clutter_shape).T

@@ -17,6 +17,7 @@ What else a measurement shows (its looks, a score) has a density relative to tha
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -31,15 +32,17 @@ NEVER = -1e9  # log of nothing, with a gradient
 
 
 class FalseAlarms(NamedTuple):
-    """Uniform ones.
+    """Independent of each other and in each entry.
 
     expected  number in a scan
-    low, high (d,) where they are
+    low, high (d,) where they are, uniformly
+    quantile  of uniform numbers (*, d), where they are not uniform
     """
 
     expected: float
     low: Tensor
     high: Tensor
+    quantile: Callable[[Tensor], Tensor] | None = None
 
 
 class Looks(NamedTuple):
@@ -107,8 +110,9 @@ class ScanSet(TorchDistribution):
         measured = self.predicted + error[..., 0]
         alarms = capacity(num, self.false_alarms.expected) - num
         count = torch.poisson(torch.full(shape, float(self.false_alarms.expected))).clamp(max=alarms)
-        low, high = self.false_alarms.low, self.false_alarms.high
-        false = low + (high - low) * torch.rand(*shape, alarms, d)
+        _, low, high, quantile = self.false_alarms
+        uniform = torch.rand(*shape, alarms, d)
+        false = low + (high - low) * uniform if quantile is None else quantile(uniform)
         present = torch.cat([seen, torch.arange(alarms) < count[..., None]], -1)
         values = wrapped(torch.cat([measured, false], -2), self.period)
         source = torch.cat([torch.arange(num), torch.full((alarms,), -1)]).expand(present.shape)
@@ -131,7 +135,8 @@ class ScanSet(TorchDistribution):
     def tables(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Log weights of an association: of objects detected as measurements (*B, S, M), of objects missed (*B, S),
         and of measurements that are false alarms (*B, M)."""
-        present, z, feature = value[..., 0] > 0.5, value[..., 1 : 1 + len(self.period)], value[..., -self.num_kinds :]
+        present, feature = value[..., 0] > 0.5, value[..., -self.num_kinds :]
+        z = torch.where(present[..., None], value[..., 1 : 1 + len(self.period)], 0.0)
         residual = wrapped(z[..., None, :, :] - self.predicted[..., :, None, :], self.period)  # (*B, S, M, d)
         factor = torch.linalg.cholesky(self.noise)
         white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]

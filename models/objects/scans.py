@@ -56,7 +56,7 @@ def check_scan(scan: Scan, names: Sequence[str], num_kinds: int) -> Scan:
         )
     where, num = f"the scan of sensor '{scan.sensor}' at {scan.time:g} s", len(scan.values)
 
-    def numbers(name: str, value: Any, shape: tuple[int, ...]) -> Floats:
+    def numbers(name: str, value: Any, shape: tuple[int, ...], cure: str = "leave that measurement out") -> Floats:
         found = np.asarray(value, dtype=np.float64)
         if not found.size and not math.prod(shape):
             return np.zeros(shape)
@@ -64,11 +64,11 @@ def check_scan(scan: Scan, names: Sequence[str], num_kinds: int) -> Scan:
             raise InputError(f"{where} has {name} of shape {found.shape}; give {shape}")
         if not np.isfinite(found).all():
             at = tuple(np.argwhere(~np.isfinite(found))[0].tolist())
-            raise InputError(f"{where} has {found[at]} in its {name}, at {list(at)}; leave that measurement out")
+            raise InputError(f"{where} has {found[at]} in its {name}, at {list(at)}; {cure}")
         return found
 
     values = numbers(f"values of ({', '.join(names)})", scan.values, (num, len(names)))
-    pose = numbers("pose (x, y, heading)", scan.pose, (3,))
+    pose = numbers("pose (x, y, heading)", scan.pose, (3,), "give where the car was")
     noise, score, likeness = scan.noise, scan.score, scan.likeness
     if noise is not None:
         noise = numbers("covariances", noise, (num, len(names), len(names)))

@@ -113,7 +113,7 @@ def scan_set(
         noise,
         detection,
         kind,
-        FalseAlarms(sensor.clutter, low, high),
+        FalseAlarms(sensor.false_alarms, low, high, lambda u: torch.from_numpy(sensor.clutter_quantile(u.numpy()))),
         lambda z: torch.from_numpy(sensor.clutter_intensity(z.numpy())),
         torch.from_numpy(sensor.period),
         len(model.kinds),

@@ -161,6 +161,16 @@ class Sensor:
         """(d, 2) lowest and highest false alarm."""
         raise NotImplementedError
 
+    @property
+    def false_alarms(self) -> float:
+        """Expected in a scan, int lambda_c."""
+        return self.clutter
+
+    def clutter_quantile(self, uniform: Floats) -> Floats:
+        """False alarms (*, d) of uniform numbers (*, d): independent entries of density lambda_c / int lambda_c."""
+        low, high = self.span.T
+        return np.asarray(low + (high - low) * uniform)
+
     def clutter_intensity(self, values: Floats) -> Floats:
         """lambda_c (*, M) of values (*, M, d): uniform over the span; the same beyond it, where noise may lead."""
         return np.full(values.shape[:-1], self._clutter_density)

@@ -157,7 +157,7 @@ def over_time(
             sure[tracks.scan[own]] = tracks.existence[own]
             existence.plot(tracks.time, sure, lw=1.2, color=colour[label])
             existence.plot(tracks.time[alone(sure)], sure[alone(sure)], ".", ms=4, mew=0, color=colour[label])
-    above = existence.axhline(threshold, color=TRACK, lw=0.8, ls=":", label="above: a track, in its colour from above")
+    above = existence.axhline(threshold, color=TRACK, lw=0.8, ls=":", label="a track above this")
     existence.legend(handles=[above], frameon=False, fontsize=8, loc="lower right")
     existence.set(ylim=(-0.03, 1.05), ylabel="existence")
     low, high = (tracks.count_quantile(q) for q in BAND)

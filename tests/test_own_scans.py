@@ -9,7 +9,7 @@ import pytest
 
 from experiments.scenarios.crossing_targets import crossing_targets
 from experiments.scenarios.own_scans import own_scans, write, write_truth
-from experiments.scenarios.urban_sensors import suite, urban_sensors
+from experiments.scenarios.urban_sensors import traffic, urban_sensors
 from models.objects.motion import ConstantVelocity
 from models.objects.scans import Recording, Scan
 from models.objects.sensors import Position, RangeBearing
@@ -17,8 +17,7 @@ from models.objects.traffic import Kind, Traffic
 from models.program import InputError
 from models.toys.gaussian import ConjugateGaussian
 
-NAMES = ("car", "bicycle", "pedestrian")
-URBAN = Traffic(suite(NAMES, ("radar", "laser", "camera")), kinds=tuple(Kind(name=n, share=1 / 3) for n in NAMES))
+URBAN = traffic()
 PLOTS = Traffic((Position(name="plots", noise_std=(1.0, 1.0)),), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),))
 LASER = Traffic((RangeBearing(name="laser", noise_std=(0.1, 0.01), reach=(0.0, 50.0)),))
 DRIVE = "vehicle,t,x,y\na,0,0,0\na,2,20,4\nb,0,100,0\nb,2,100,0\n"

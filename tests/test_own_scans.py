@@ -69,6 +69,14 @@ def test_the_truth_moves_evenly_between_its_rows_and_ends_where_no_sensor_sees(t
     np.testing.assert_allclose(truth.position, [[5, 1], [15, 3]])
 
 
+def test_a_vehicle_is_away_where_its_rows_are_far_apart(tmp_path: Path) -> None:
+    drive = "vehicle,t,x,y\n" + "".join(f"a,{t},{t},0\n" for t in (0, 1, 2, 9, 10, 11))
+    scans = "t,sensor,range,bearing\n" + "".join(f"{t},laser,,\n" for t in (0.5, 2, 5, 9, 10.5, 12))
+    truth = own_scans(table(tmp_path, scans), LASER, table(tmp_path, drive, "truth.csv")).truth
+    np.testing.assert_array_equal(np.diff(truth.offset), [1, 1, 0, 1, 1, 0])
+    np.testing.assert_allclose(truth.x, [0.5, 2, 9, 10.5])
+
+
 def test_an_empty_scan_survives_the_table(tmp_path: Path) -> None:
     recording = Recording((Scan("plots", 0.0, np.zeros((0, 2)), np.zeros(3)), *crossing_targets(0).data.scans[1:3]))
     write(tmp_path / "scans.csv", recording, PLOTS)

@@ -36,6 +36,7 @@ from models.program import InputError
 REQUIRED = ("t", "sensor")
 POSE = ("car_x", "car_y", "car_heading")
 ANGLE = 2 * np.pi + 1e-2  # the largest that is one in radians
+GAP = 5.0  # of the usual step: a vehicle is away between rows that are farther apart
 NO_OPINION = 0.5  # a score that speaks neither for nor against
 
 
@@ -55,8 +56,8 @@ def own_scans(path: str, traffic: Traffic, truth_path: str | None = None) -> Sce
     """Any user's scans from a .csv or .csv.gz file.
 
     traffic     the model, whose sensors tell what columns mean
-    truth_path  of a table of who was where; between two rows of a vehicle it moves evenly. Who is in view of no sensor
-                is no part of the truth
+    truth_path  of a table of who was where; between two rows of a vehicle it moves evenly, unless they are more than
+                five usual steps apart: then it is away. Who is in view of no sensor is no part of the truth
 
     Raises InputError with file, row, column, value and remedy for whatever cannot be read, for a sensor that the model
     does not have, a scan in two pieces, degrees instead of radians, and a truth of another time."""
@@ -212,10 +213,15 @@ def _truth(path: str, vehicles: list[Recorded], scans: tuple[Scan, ...], traffic
             f"{path}: the truth is of {span[0]:g} to {span[1]:g} s, the scans are of {time[0]:g} to {time[-1]:g} s; "
             "give both on the same clock"
         )
+    steps = np.concatenate([np.diff(v.t) for v in vehicles])
+    longest = GAP * float(np.median(steps)) if len(steps) else 0.0
     place = np.full((len(time), len(vehicles), 2), np.nan)
     heading = np.full((len(time), len(vehicles)), np.nan)
     for i, v in enumerate(vehicles):
         there = (time >= v.t[0]) & (time <= v.t[-1])
+        after = np.clip(np.searchsorted(v.t, time), 1, max(len(v.t) - 1, 1))
+        if len(v.t) > 1:
+            there &= (v.t[after] - v.t[after - 1] <= longest) | np.isin(time, v.t)
         for axis in (0, 1):
             place[there, i, axis] = np.interp(time[there], v.t, v.points[:, axis])
         if v.heading is not None:

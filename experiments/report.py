@@ -123,10 +123,16 @@ def _scores(scores: dict[str, float], metrics: list[dict[str, Any]]) -> str:
 
 
 def meanings(scores: Iterable[str], modules: Iterable[str]) -> dict[str, str]:
-    """What docstrings of the metrics' modules say of scores, in lines 'name  meaning'."""
-    text = "\n".join(file.read_text() for module in dict.fromkeys(modules) if (file := source_of(module)))
+    """What docstrings of the metrics' modules say of scores, in lines 'name  meaning'; then those of modules of
+    experiments that they speak of."""
+    own = "\n".join(_texts(modules))
+    text = "\n".join([own, *_texts(re.findall(r"\bexperiments\.\w+", own))])
     lines = {name: re.search(rf"^ +{re.escape(name)}  +(\S.*)$", text, re.MULTILINE) for name in scores}
     return {name: line[1] for name, line in lines.items() if line}
+
+
+def _texts(modules: Iterable[str]) -> list[str]:
+    return [file.read_text() for module in dict.fromkeys(modules) if (file := source_of(module))]
 
 
 def _labelled(posterior: Posterior, diagnostics: dict[str, Any]) -> dict[str, Any]:

@@ -158,15 +158,18 @@ def _infer(engine: Engine, model: Any, evidence: Any, seed: int) -> Posterior:
 def remedies(model: Any, evidence: Any) -> Iterator[None]:
     """Where an engine refuses a model's latents or densities, name engines that run it."""
     from models.capability import HasSteps
+    from models.multi_object import HasObjects
     from models.program import InputError
 
     try:
         yield
     except InputError as error:
-        name = type(model).__name__
-        if "fix()" not in str(error):
+        name, many = type(model).__name__, isinstance(model, HasObjects)
+        if "fix()" not in str(error) and not (many and "moves()" in str(error)):
             raise
-        if hasattr(model, "moves"):
+        if many:
+            about, fit = f"{name} is of many objects that come and go", "engine=lmb, lmb_smoothed or track_mcmc"
+        elif hasattr(model, "moves"):
             about = f"{name} has an unknown number of parts, and this engine takes a known one"
             fit = "engine=rjmcmc or smc_structure"
             if hasattr(model, "kernel") and model.kernel(evidence).num_edits:  # a greedy search can polish it

@@ -15,7 +15,7 @@ import difflib
 import functools
 from collections.abc import Iterable, Iterator
 from dataclasses import field, make_dataclass
-from typing import Any
+from typing import Any, get_args
 
 from omegaconf import MISSING, BooleanNode, Container, DictConfig, IntegerNode, ListConfig, OmegaConf
 
@@ -66,8 +66,11 @@ def expand(config: DictConfig) -> None:
     for parent, key, path, node in list(_targets(config)):
         allowed = _allowed(path, node)
         for name, knob in allowed.items():
-            if knob.kind is bool and name in node and not OmegaConf.is_missing(node, name):
-                _refuse_number(f"{path}.{name}", node[name])
+            if name in node and not OmegaConf.is_missing(node, name):
+                if knob.kind is bool:
+                    _refuse_number(f"{path}.{name}", node[name])
+                elif isinstance(found := node._get_node(name), ListConfig) and _leaf(knob.kind) is float:
+                    node[name] = _floats(OmegaConf.to_container(found))
         entries: list[Any] = [("_target_", str, node["_target_"])]
         entries += [("_partial_", bool, field(default=True))] if node.get("_partial_", False) else []
         entries += [(k.name, k.kind, _default(k.default)) for k in allowed.values()]
@@ -76,6 +79,20 @@ def expand(config: DictConfig) -> None:
     for key, value in config.items():
         if isinstance(value, bool | int):
             config[key] = (BooleanNode if isinstance(value, bool) else IntegerNode)(value, is_optional=False)
+
+
+def _leaf(kind: Any) -> Any:
+    """Of what lists of lists are."""
+    while arguments := get_args(kind):
+        kind = arguments[0]
+    return kind
+
+
+def _floats(value: Any) -> Any:
+    """Whole numbers as floats, in lists of lists, too: OmegaConf takes them for floats in plain lists only."""
+    if isinstance(value, list):
+        return [_floats(item) for item in value]
+    return float(value) if type(value) is int else value
 
 
 def _allowed(path: str, node: DictConfig) -> dict[str, Knob]:

@@ -94,6 +94,8 @@ class Animation:
             outline_truth(axes, self.truth, slice(self.truth.offset[true], self.truth.offset[true + 1]))
         outline_tracks(axes, self.tracks, t, self.colour)
         axes.text(0.02, 0.98, f"{now:.2f} s  {sensor}", transform=axes.transAxes, va="top", fontsize=9, color=TRUE)
+        key = "x measurement   shaded: 90 %" if self.truth is None else "black: true   x measurement   shaded: 90 %"
+        axes.text(0.98, 0.02, key, transform=axes.transAxes, ha="right", fontsize=7, color=UNSURE)
         scale(axes)
 
 

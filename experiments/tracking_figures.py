@@ -74,6 +74,7 @@ def colours(label: Ints) -> dict[int, str]:
 
 def ego(data: Any) -> Floats | None:
     """(T, 2) positions of the car at the scans, None where they do not tell."""
+    data = getattr(data, "scans", data)
     scans = list(data) if isinstance(data, Sequence) else []
     if not scans or not all(hasattr(scan, "pose") for scan in scans):
         return None
@@ -112,6 +113,7 @@ def from_above(tracks: Tracks, truth: TrafficTruth | None, readings: Readings, c
     told = {label for label, _ in lasting[:NAMED]}
     for label, path in zip(np.unique(tracks.label), places, strict=True):
         axes.plot(*path.T, lw=2.2, color=colour[int(label)], solid_capstyle="round", zorder=3)
+        axes.plot(*path[alone(path[:, 0])].T, ".", ms=5, mew=0, color=colour[int(label)], zorder=3)
         if int(label) in told:
             begin = path[~np.isnan(path[:, 0])][0]
             note(axes, begin, str(label), colour[int(label)])
@@ -120,6 +122,12 @@ def from_above(tracks: Tracks, truth: TrafficTruth | None, readings: Readings, c
     axes.set_title(f"{len(lasting)} tracks", loc="left", color=INK, fontsize=11)
     axes.legend(handles=handles, frameon=False, fontsize=9, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     return figure
+
+
+def alone(values: Floats) -> NDArray[np.bool_]:
+    """(T,) which have no neighbour, so that a line does not show them; NaN are none."""
+    there = np.concatenate([[False], np.isfinite(values), [False]])
+    return there[1:-1] & ~there[:-2] & ~there[2:]
 
 
 def note(axes: Axes, place: Floats, text: str, colour: str) -> None:
@@ -143,11 +151,14 @@ def over_time(
     rows = 2 if truth is None else 3
     figure = Figure(figsize=(8.0, 2.1 * rows), layout="constrained")
     existence, count, *rest = figure.subplots(rows, 1, sharex=True)
-    time = tracks.time[tracks.scan]
     for label, own in rows_by_label(tracks.label).items():
         if label in colour:
-            existence.plot(time[own], tracks.existence[own], lw=1.2, color=colour[label])
-    existence.axhline(threshold, color=TRACK, lw=0.8, ls=":")
+            sure = np.full(len(tracks.time), np.nan)
+            sure[tracks.scan[own]] = tracks.existence[own]
+            existence.plot(tracks.time, sure, lw=1.2, color=colour[label])
+            existence.plot(tracks.time[alone(sure)], sure[alone(sure)], ".", ms=4, mew=0, color=colour[label])
+    above = existence.axhline(threshold, color=TRACK, lw=0.8, ls=":", label="a track above this")
+    existence.legend(handles=[above], frameon=False, fontsize=8, loc="lower right")
     existence.set(ylim=(-0.03, 1.05), ylabel="existence")
     low, high = (tracks.count_quantile(q) for q in BAND)
     count.fill_between(tracks.time, low, high, step="mid", color=ESTIMATE, alpha=0.25, lw=0, label="90 % band")

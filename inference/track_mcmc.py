@@ -184,6 +184,8 @@ def run(
     for name, value in (("num_chains", num_chains), ("thin", thin), ("reach", reach)):
         if value < 1:
             raise InputError(f"{name} is {value}; track_mcmc needs 1 or more")
+    if num_steps < thin:
+        raise InputError(f"num_steps is {num_steps}, but every {thin}. step is kept (thin); give {thin} or more")
     if not 0 <= warmup <= num_steps - thin:
         raise InputError(f"warmup is {warmup}; choose 0 to {num_steps - thin}, so that num_steps - thin are left")
     window = window_of(model, scans)

@@ -56,7 +56,7 @@ def require_objects(model: Any, engine: str) -> None:
     if not isinstance(model, HasObjects):
         raise InputError(
             f"{engine} needs a model of many objects, with move, view, unseen and arrivals; {type(model).__name__} is "
-            "none: choose model=traffic"
+            "none: choose one whose name begins with traffic_, such as model=traffic_plots"
         )
 
 

@@ -129,6 +129,14 @@ def test_a_tuple_stays_a_tuple_and_an_unshown_default_stays_the_targets_own(pack
     assert model.inner.width == 2.0
 
 
+def test_whole_numbers_are_floats_in_lists_of_lists_too(package: str, tmp_path: Path) -> None:
+    (tmp_path / f"{package}.py").write_text("def pairs(of: tuple[tuple[float, float], ...] = ()): return of\n")
+    config = OmegaConf.create({"scenario": {"_target_": f"{package}.pairs", "of": [[0, 2], [1.5, 3]]}})
+    expand(config)
+    (first, _) = found = build(plain(config))["scenario"]
+    assert found == ((0.0, 2.0), (1.5, 3.0)) and isinstance(first[0], float)
+
+
 def test_a_value_outside_its_literal_is_refused(package: str) -> None:
     config = OmegaConf.create({"model": {"_target_": f"{package}.Model", "colour": "gren"}})
     expand(config)

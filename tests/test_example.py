@@ -8,8 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hydra import compose, initialize_config_module
 
+from experiments.command import plain
+from experiments.schema import build
+from inference import lmb
 from models.program import check, simulate
 from tests.involution import assert_involution, uniforms
 
@@ -40,6 +45,29 @@ def test_example_runs_from_anywhere_by_file_and_python_path(tmp_path: Path) -> N
     short = ("engine.num_steps=20", "engine.warmup=10")
     scores = launch(tmp_path, tmp_path / "runs", search, *short, path=str(EXAMPLES))
     assert "true_model_probability" in scores
+
+
+def test_scans_of_a_sensor_outside_the_tree_are_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three objects among false alarms, with the height that only this sensor tells: within four standard errors."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.chdir(EXAMPLES)
+    with initialize_config_module("configs", version_base="1.3"):
+        config = plain(compose("run", ["hydra.searchpath=[pkg://laser_3d.configs]", "experiment=ramp"]))
+    built = build({key: config[key] for key in ("scenario", "model")})
+    scene = built["scenario"]
+    last = lmb.run(built["model"], scene.data.scans).confirmed(0.5).at(len(scene.data.scans) - 1)
+    from laser_3d.made import SCANS, STEP, WAYS
+
+    now = STEP * (SCANS - 1)
+    true = [(x + vx * now, y + vy * now, z + rate * now) for x, y, vx, vy, z, rate in WAYS]
+    names = built["model"].names
+    entries = [names.index(name) for name in ("x", "y", "z")]
+    assert len(last.label) == len(true)
+    for place in true:
+        gap = last.mean[:, entries] - place
+        nearest = int(np.abs(gap[:, :2]).sum(1).argmin())
+        std = np.sqrt(np.diagonal(last.covariance[nearest])[entries])
+        assert (np.abs(gap[nearest]) < 4.0 * std).all()
 
 
 def test_example_keeps_to_the_seam_in_forty_lines(monkeypatch: pytest.MonkeyPatch) -> None:

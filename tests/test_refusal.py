@@ -12,12 +12,15 @@ from experiments.fixed_structure import estimate
 from experiments.run import remedies
 from inference import bbvi, importance, least_squares, nuts, particle_filter, rjmcmc, smc
 from inference.refusal import ask
+from models.objects.sensors import Position
+from models.objects.traffic import Traffic
 from models.program import InputError, simulate
 from models.toys.gaussian import ConjugateGaussian, Readings
 from models.toys.linear_walk import Fix, LinearWalk
 from tests.small_junction import FULL, NOTHING, blank_evidence, one, with_points
 
 FOREVER = 10**12
+TRAFFIC = Traffic((Position(name="plots", noise_std=(1.0, 1.0)),))
 LINE = ConjugateGaussian()
 READINGS = Readings(torch.linspace(-1.0, 1.0, 5), torch.zeros(5, dtype=torch.float64))
 ENDLESS: dict[str, Any] = {
@@ -65,6 +68,7 @@ def test_an_engine_of_the_user_is_not_run_to_ask_it() -> None:
     ("model", "says"),
     [
         (FULL, "Junction has an unknown number of parts, .* bbvi_structure"),
+        (TRAFFIC, "Traffic is of many objects that come and go; choose engine=lmb"),
         (LinearWalk(), "LinearWalk goes on from frame to frame; choose engine=particle_filter"),
     ],
 )

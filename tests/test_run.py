@@ -61,6 +61,7 @@ def test_scores_are_explained_by_the_docstrings_of_their_metrics() -> None:
     names = ["error_40_m", "covered_140", "inside_tight", "range_m", "trusted_true", "coverage"]
     roads = meanings(names, ["experiments.road_metrics"])
     assert list(roads) == names and not any('"' in meaning for meaning in roads.values())
+    assert meanings(["gospa_m"], ["experiments.view_metrics"]) == {"gospa_m": "GOSPA distance of the positions"}
 
 
 def test_the_arms_of_tracks_without_truth_are_told(launch: Command) -> None:

@@ -31,7 +31,7 @@ from models.objects.sensors import (
     sensor_formulas,
     spread_formula,
 )
-from models.objects.traffic import Kind, Traffic
+from models.objects.traffic import Kind, Place, Traffic
 from models.program import InputError
 
 Floats = NDArray[np.float64]
@@ -335,3 +335,36 @@ def test_scores_are_odds() -> None:
     plots = Position(name="plots", noise_std=(1.0, 1.0))
     scan = Scan("plots", 0.0, np.zeros((3, 2)), np.zeros(3), score=np.array([0.0, 0.5, 0.75]))
     np.testing.assert_allclose(plots.feature(scan, 2), np.array([[0.0], [1.0], [3.0]]) * np.ones(2), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"noise": (0.6, -0.1, 0.0)}, "kind object: noise is -0.1; give 0 or more"),
+        ({"noise": (0.6, math.nan, 0.0)}, "kind object: noise is nan"),
+        ({"speed": (8.0, -4.0)}, "kind object: the second of speed is -4.0"),
+        ({"acceleration_std": math.inf}, "acceleration_std is inf"),
+        ({"visibility": 1.5}, "visibility is 1.5; give a number from 0 to 1"),
+    ],
+)
+def test_kinds_that_cannot_be_are_refused(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Kind(**settings)
+
+
+class Bend(ConstantTurn):
+    """A motion of somebody's own, with an entry of which nothing is known."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("x", "y", "heading", "speed", "curvature", "acceleration")
+
+
+def test_traffic_that_cannot_be_is_refused() -> None:
+    for density in (-1.0, math.nan, math.inf):
+        with pytest.raises(InputError, match=f"unseen_density is {density}"):
+            Traffic((SENSORS[1],), unseen_density=density)
+    with pytest.raises(InputError, match=r"nothing says what curvature of the motion's .* make it an extra"):
+        Traffic((SENSORS[1],), Bend())
+    with pytest.raises(InputError, match=r"the place at \(0.0, 0.0\) has std 0.0 and rate 0.1"):
+        Place((0.0, 0.0), 0.0, 0.1)

@@ -277,6 +277,7 @@ def test_empty_scans_have_no_objects() -> None:
     [
         ({"start": "anywhere"}, "start is 'anywhere'; choose lmb or nothing"),
         ({"num_chains": 0}, "num_chains is 0; track_mcmc needs 1 or more"),
+        ({"num_steps": 0}, "num_steps is 0, but every 10. step is kept"),
         ({"warmup": 2995}, "warmup is 2995; choose 0 to 2990"),
     ],
 )

@@ -16,6 +16,7 @@ from experiments.tracking_animation import Animation, boxes
 from experiments.tracking_figures import colours, ego, figures
 from inference.posterior import Posterior
 from inference.tracks import Tracks
+from models.objects.scans import Recording, Scan
 from tests.drawn_tracks import believed, traffic
 
 
@@ -95,6 +96,20 @@ def test_the_picture_shows_each_path_with_its_gaps() -> None:
     shown = {tuple(np.isnan(line.get_xdata()).nonzero()[0]) for line in axes.lines if line.get_linewidth() > 2}
     assert shown == {(7,), (0, 1, 2, 3), (15, 16, 17, 18, 19)}
     assert {text.get_text() for text in axes.texts} == {"10", "11", "12"}
+    existence = figures(tracks.confirmed(0.5), Scene(None, truth, "drawn", {}), frames=0)["over_time"].axes[0]
+    lines = {tuple(np.isnan(line.get_ydata()).nonzero()[0]) for line in existence.lines if line.get_linewidth() == 1.2}
+    assert lines == shown
+
+
+def test_a_track_of_one_scan_is_a_point() -> None:
+    truth = traffic()
+    existence = np.full(len(truth.label), 0.2)
+    row = np.flatnonzero(truth.label == 10)[7]
+    existence[row] = 0.9
+    tracks = replace(believed(truth), existence=existence, draws={})
+    (axes,) = figures(tracks, Scene(None, truth, "drawn", {}), frames=0)["tracks"].axes
+    points = np.concatenate([line.get_xydata() for line in axes.lines if line.get_marker() == "."])
+    np.testing.assert_array_equal(points, tracks.position[row][None])
 
 
 def test_the_view_goes_with_the_car_or_else_with_the_objects() -> None:
@@ -102,6 +117,8 @@ def test_the_view_goes_with_the_car_or_else_with_the_objects() -> None:
     tracks, scene = believed(truth), Scene(drive(), truth, "drawn", {})
     low, high = figures(tracks, scene, view=30.0)["animation"].corners()
     np.testing.assert_allclose(0.5 * (low + high), ego(scene.data))
+    recorded = Recording(tuple(Scan("s", scan.time, scan.points, scan.pose) for scan in scene.data))
+    np.testing.assert_array_equal(ego(recorded), ego(scene.data))
     np.testing.assert_allclose(high - low, 30.0)
     low, high = figures(tracks, Scene(None, truth, "drawn", {}), view=30.0)["animation"].corners()
     middle = 0.5 * (low + high)

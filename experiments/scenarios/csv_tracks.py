@@ -8,15 +8,14 @@ ignored.
 from __future__ import annotations
 
 import csv as table
-import gzip
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from experiments.scenarios import paths
+from experiments.scenarios.csv_table import number_of, rows_of
 from experiments.scenarios.scene import Floats, Scene, join_tracks
 from models.intersection.tracks import Tracks
 from models.program import InputError
@@ -158,7 +157,7 @@ def read(path: str | Path, types: tuple[str, ...] | None = None) -> list[Recorde
     rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
     first: dict[tuple[str, str], int] = {}
     has_heading = False
-    for number, row in _rows(Path(path)):
+    for number, row in rows_of(Path(path), REQUIRED, " and, where measured, heading"):
         has_heading = "heading" in row
         if types is not None and row["type"] not in types:
             continue
@@ -167,7 +166,7 @@ def read(path: str | Path, types: tuple[str, ...] | None = None) -> list[Recorde
         key = (row.get("recording", ""), row["vehicle"])
         where = f"{path}, row {number}, vehicle {row['vehicle']}"
         columns = ("t", "x", "y", "heading") if has_heading else ("t", "x", "y")
-        values = tuple(_number(where, column, row[column]) for column in columns)
+        values = tuple(number_of(where, column, row[column]) for column in columns)
         before = rows.setdefault(key, [])
         _check_row(where, values, before)
         before.append(values)
@@ -181,44 +180,6 @@ def read(path: str | Path, types: tuple[str, ...] | None = None) -> list[Recorde
         vehicles.append(Recorded(key[1], first[key], array[:, 0], array[:, 1:3], heading))
     _check_all(path, vehicles)
     return vehicles
-
-
-def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of the file with their line numbers, the header being line 1."""
-    opener = gzip.open if path.suffix == ".gz" else open
-    try:
-        with opener(path, "rt", newline="", encoding="utf-8-sig") as file:
-            reader = table.DictReader(file, skipinitialspace=True)
-            header = reader.fieldnames or []
-            if not header:
-                raise InputError(f"{path}: the file is empty; give a table with the columns {', '.join(REQUIRED)}")
-            if len(header) == 1 and (found := next((d for d in ";\t|" if d in header[0]), None)):
-                raise InputError(
-                    f"{path}: columns are separated by {found!r}; separate them by commas, decimals by points"
-                )
-            header = reader.fieldnames = [column.strip().lower() for column in header]
-            missing = [column for column in REQUIRED if column not in header]
-            if missing:
-                raise InputError(
-                    f"{path}: no column {' and no column '.join(missing)}, the header has {', '.join(header)}; "
-                    f"name the columns {', '.join(REQUIRED)} and, where measured, heading"
-                )
-            for row in reader:
-                yield reader.line_num, row
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; it was looked for at {path.resolve()}") from None
-    except (OSError, EOFError, UnicodeDecodeError, table.Error) as error:
-        raise InputError(f"{path}: this cannot be read as a table ({error}); give a .csv or .csv.gz file") from None
-
-
-def _number(where: str, column: str, text: str | None) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{where}: {column} is '{text or ''}', not a number; correct the value or remove the row")
-    return value
 
 
 def _check_row(where: str, values: tuple[float, ...], before: list[tuple[float, ...]]) -> None:

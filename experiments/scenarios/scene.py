@@ -70,7 +70,7 @@ class TrafficTruth(NamedTuple):
     vx, vy         (R,) [m/s], nan where unknown
     heading        (R,) [rad], nan where unknown
     length, width  (R,) [m], nan where objects are points
-    kind           (R,) index of its kind, as in the model
+    kind           (R,) index of its kind, as in the model, -1 where unknown
     """
 
     time: Floats

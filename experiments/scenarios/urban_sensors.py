@@ -115,9 +115,7 @@ def urban_sensors(
     clocks = {s.name: ticks_of(s.name, duration) for s in SUITE if s.name in sensors}
     ticks = np.unique(np.concatenate(list(clocks.values())))
     world = road_users(ticks, number, kinds, np.random.default_rng(way_seed))
-    own = suite(kinds, sensors)
-    there = tuple(replace(s, weather=BAD_WEATHER) if bad_weather and s.name == "camera" else s for s in own)
-    model = Traffic(there, ConstantTurn(), tuple(Kind(name=kind, share=1 / len(kinds)) for kind in kinds))
+    model = traffic(kinds, sensors, bad_weather)
     pose, scans, arrival = np.zeros(3), list[Scan](), list[float]()
     for sensor, own_seed in zip(SUITE, scan_seeds, strict=True):
         rng = np.random.default_rng(own_seed)
@@ -131,7 +129,7 @@ def urban_sensors(
                 scans.append(scan)
                 arrival.append(when + latency * (sensor.name == "camera"))
     order = np.lexsort(np.array([[scan.time for scan in scans], arrival]))
-    told = in_view(own, model.motion, world, np.zeros((len(ticks), 3)))
+    told = in_view(suite(kinds, sensors), model.motion, world, np.zeros((len(ticks), 3)))
     info = {"scenario": "urban_sensors", "seed": seed, "number": number, "duration_s": duration}
     info |= {"kinds": ", ".join(kinds), "sensors": ", ".join(sensors), "dropout": dropout or "none"}
     info |= {"bad_weather": bad_weather, "latency_s": latency, "raw_laser": raw_laser, "outlines": outlines}
@@ -212,6 +210,14 @@ def suite(kinds: tuple[str, ...], sensors: tuple[str, ...]) -> tuple[Sensor, ...
     right = (1.0 - CONFUSED * num) * np.eye(num) + CONFUSED
     table = tuple(tuple(row) for row in [*right.tolist(), [1.0 / num] * num]) if num > 1 else None
     return tuple(replace(s, confusion=table) if s.name == "camera" else s for s in SUITE if s.name in sensors)
+
+
+def traffic(
+    kinds: tuple[str, ...] = tuple(HABITS), sensors: tuple[str, ...] = tuple(CLOCK), bad_weather: bool = False
+) -> Traffic:
+    """The model that scans are simulated by; in bad weather the camera misses more."""
+    own = (replace(s, weather=BAD_WEATHER) if bad_weather and s.name == "camera" else s for s in suite(kinds, sensors))
+    return Traffic(tuple(own), ConstantTurn(), tuple(Kind(name=kind, share=1 / len(kinds)) for kind in kinds))
 
 
 def beams(sensor: Sensor, world: World, t: int, rng: np.random.Generator, outlines: bool) -> Scan:

@@ -73,6 +73,14 @@ class Kind:
         for what in ("share", "lifetime", "radius"):
             if not 0.0 < getattr(self, what) < math.inf:
                 raise InputError(f"kind {self.name}: {what} is {getattr(self, what)}; give a positive number")
+        spreads = {"noise": tuple(self.noise), "the second of speed": self.speed[1:]}
+        spreads |= {"the second of extras": tuple(std for _, std in self.extras)}
+        spreads |= {what: (getattr(self, what),) for what in ("yaw_rate_std", "acceleration_std")}
+        for what, values in spreads.items():
+            if wrong := [value for value in values if not 0.0 <= value < math.inf]:
+                raise InputError(f"kind {self.name}: {what} is {wrong[0]}; give 0 or more")
+        if not 0.0 <= self.visibility <= 1.0:
+            raise InputError(f"kind {self.name}: visibility is {self.visibility}; give a number from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,13 @@ class Place:
     std: float
     rate: float
     heading: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.std < math.inf or not 0.0 <= self.rate < math.inf:
+            raise InputError(
+                f"the place at {tuple(self.position)} has std {self.std} and rate {self.rate}; "
+                "give a positive standard deviation, and a rate of 0 or more"
+            )
 
 
 @dataclass(frozen=True)
@@ -100,6 +115,8 @@ class Traffic:
     slots: int = 6  # for objects of the program
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.unseen_density < math.inf:
+            raise InputError(f"unseen_density is {self.unseen_density}; give the objects on a square metre, 0 or more")
         names = [sensor.name for sensor in self.sensors]
         if len(set(names)) < len(names):
             raise InputError(f"sensors are called {names}; give each a name of its own")
@@ -111,6 +128,12 @@ class Traffic:
                 )
         if abs(sum(kind.share for kind in self.kinds) - 1.0) > 1e-9:
             raise InputError(f"the shares of kinds are {[kind.share for kind in self.kinds]}; make them sum to one")
+        for kind in self.kinds:
+            if unknown := [name for name in self.names if name not in _known(self.motion, kind)]:
+                raise InputError(
+                    f"nothing says what {unknown[0]} of the motion's {self.names} is of an object first seen; "
+                    "make it an extra, of which kinds give mean and standard deviation"
+                )
         body = self.motion.body((0.0,) * len(self.names), math)
         for sensor in self.sensors:
             if missing := [name for name in sensor.reads if getattr(body, name) is None]:
@@ -368,9 +391,14 @@ class Traffic:
 @lru_cache
 def _state_prior(motion: Motion, kind: Kind) -> tuple[Floats, Floats]:
     """Mean and standard deviation (n,) of a newcomer's state; those of position and heading are zero."""
+    known = _known(motion, kind)
+    loc, std = zip(*(known[name] for name in motion.names), strict=True)
+    return np.array(loc), np.array(std)
+
+
+def _known(motion: Motion, kind: Kind) -> dict[str, tuple[float, float]]:
+    """The same of every entry that a motion may have, by name."""
     known = {"yaw_rate": (0.0, kind.yaw_rate_std), "acceleration": (0.0, kind.acceleration_std), "speed": kind.speed}
     drift = math.hypot(*kind.speed)  # of vx and vy where no heading tells which way
     known |= {"vx": (0.0, drift), "vy": (0.0, drift)} | dict(zip(motion.extras, kind.extras, strict=True))
-    known |= dict.fromkeys(("x", "y", "heading"), (0.0, 0.0))
-    loc, std = zip(*(known[name] for name in motion.names), strict=True)
-    return np.array(loc), np.array(std)
+    return known | dict.fromkeys(("x", "y", "heading"), (0.0, 0.0))

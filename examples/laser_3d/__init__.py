@@ -1,0 +1,1 @@
+"""Scans of a sensor that nothing in the tree knows."""

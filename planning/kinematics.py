@@ -6,7 +6,7 @@ In the frame that moves along with the foot point (x ahead, y left; w = 1 - kapp
     v_x = s' w                                           v_y = d'
     a_x = s'' w - s' (kappa' s' d + kappa d') - kappa s' d'     a_y = d'' + kappa s'^2 w
 
-so that, of the path: speed v = |(v_x, v_y)|, acceleration a_t = (v . a) / v along it, and v x a = kappa_path v^3 across.
+so that the path has speed v = |(v_x, v_y)|, acceleration a_t = (v . a) / v along it, and v x a = kappa_path v^3.
 The same numbers as Werling et al. (2010), appendix I, without his division by s' and cos of the heading.
 
 An offset can also be told by arc length, d(s): slope p = dd/ds and bend q = d^2 d/ds^2, which a standing vehicle has

@@ -45,9 +45,7 @@ class ReferenceLine(NamedTuple):
         """x, y (*, 2) of the points at arc lengths s, offsets d."""
         told = self.at(s)
         d = np.asarray(d, float)
-        return np.stack(
-            [told[..., 0] - d * np.sin(told[..., 2]), told[..., 1] + d * np.cos(told[..., 2])], -1
-        )
+        return np.stack([told[..., 0] - d * np.sin(told[..., 2]), told[..., 1] + d * np.cos(told[..., 2])], -1)
 
     def project(self, points: ArrayLike, start: ArrayLike | None = None) -> tuple[Floats, NDArray[np.int64]]:
         """s, d (N, 2) of points (N, 2), and how each search ended (planning.reference_kernel: FOUND = 0).
@@ -67,8 +65,10 @@ class ReferenceLine(NamedTuple):
         return out, ended
 
 
-def from_curvature(s: ArrayLike, kappa: ArrayLike, start: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> ReferenceLine:
-    """The line from (x, y, theta) = start whose curvature goes through kappa (N,) at s (N,), smoothly (cubic spline)."""
+def from_curvature(
+    s: ArrayLike, kappa: ArrayLike, start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> ReferenceLine:
+    """From (x, y, theta) = start, with curvature through kappa (N,) at s (N,) as a cubic spline."""
     from scipy.interpolate import CubicSpline
 
     curve = CubicSpline(np.asarray(s, float), np.asarray(kappa, float))
@@ -85,7 +85,7 @@ def from_points(points: ArrayLike, *, std: float = 0.05, name: str = "reference 
     """A smooth line along points (N, 2) whose errors have standard deviation `std` [m].
 
     A quintic smoothing spline in chord length: curvature and its slope are continuous; x'' jumps nowhere.
-    Raises InputError, with `name`, for fewer than three points, NaN, points that repeat, and a line that crosses itself."""
+    Raises InputError, with `name`: fewer than three points, NaN, points that repeat, a line that crosses itself."""
     from scipy.integrate import cumulative_simpson
     from scipy.interpolate import CubicHermiteSpline, make_splprep
 

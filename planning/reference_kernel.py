@@ -1,6 +1,6 @@
 """Machine code of a reference line: its value at an arc length, and the foot point of a position.
 
-The line is a table of (x, y, theta, kappa, kappa') at multiples of `step`, between which x, y, theta and kappa are cubic
+The line is a table of (x, y, theta, kappa, kappa') at multiples of `step`; between them x, y, theta and kappa are cubic
 Hermite interpolants and kappa' is linear.
 """
 
@@ -20,7 +20,7 @@ FOUND, CURVATURE_CENTRE, BEYOND_ENDS, NOT_CONVERGED = range(4)
 @njit(error_model="numpy", inline="always")
 def line_at(table, step, s):  # type: ignore[no-untyped-def]
     """x, y, theta, kappa, kappa' at arc length s; beyond the ends the last cubic goes on."""
-    n = min(max(int(math.floor(s / step)), 0), table.shape[0] - 2)
+    n = min(max(math.floor(s / step), 0), table.shape[0] - 2)
     f = s / step - n
     g = 1.0 - f
     h00, h10, h01, h11 = (1.0 + 2.0 * f) * g * g, f * g * g * step, f * f * (3.0 - 2.0 * f), -f * f * g * step

@@ -92,6 +92,6 @@ def test_points_at_the_curvature_centre_and_beyond_the_ends_are_refused() -> Non
     ],
 )
 def test_bad_lines_are_refused_in_words(points: np.ndarray, words: str) -> None:
-    with pytest.raises(InputError, match="lane 7: .*") as refused:
+    with pytest.raises(InputError, match=r"lane 7: .*") as refused:
         from_points(points, std=0.0, name="lane 7")
     assert words in str(refused.value)

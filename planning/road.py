@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -107,7 +108,7 @@ def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
         if a not in lanes:
             known = ", ".join(map(str, list(lanes)[:8]))
             raise InputError(f"the route names lane {a}, which the map has not; it has {known}, ...")
-    for a, b in zip(ids, ids[1:], strict=False):
+    for a, b in pairwise(ids):
         if b not in lanes[a].successors:
             raise InputError(f"lane {b} of the route does not follow lane {a}, which leads to {lanes[a].successors}")
     parts = [lanes[a].centre for a in ids]

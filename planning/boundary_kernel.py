@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(error_model="numpy", inline="always")
+@njit(error_model="numpy")
 def squared_distance(segment, n, x, y):  # type: ignore[no-untyped-def]
     """From (x, y) to segment n [m^2]."""
     ax, ay = segment[n, 0], segment[n, 1]
@@ -50,14 +50,23 @@ def bucket(segment, origin, shape, cell, reach):  # type: ignore[no-untyped-def]
     return np.append(offset[1:], len(member)), member
 
 
-@njit(error_model="numpy", inline="always")
-def touches(segment, origin, shape, offset, member, cell, x, y, radius):  # type: ignore[no-untyped-def]
-    """Whether a circle of radius <= reach at (x, y) touches a line."""
-    u, v = (x - origin[0]) / cell, (y - origin[1]) / cell
-    if not (0.0 <= u < shape[0] and 0.0 <= v < shape[1]):
-        return False
-    c = int(u) * shape[1] + int(v)
-    for k in range(offset[c], offset[c + 1]):
-        if squared_distance(segment, member[k], x, y) <= radius * radius:
-            return True
-    return False
+@njit(error_model="numpy")
+def first_line(pose, lines, circles, radius):  # type: ignore[no-untyped-def]
+    """The first step at which a circle touches a line, or K.
+
+    pose (4, K): x, y, cos and sin of the heading; lines: of planning.shapes.Boundary, without its reach; circles (n,)
+    ahead along the heading, of radius <= reach."""
+    segment, origin, shape, offset, member, cell = lines
+    if len(segment) == 0:
+        return pose.shape[1]
+    x0, y0, columns, rows = origin[0], origin[1], shape[0], shape[1]
+    for k in range(pose.shape[1]):
+        for n in range(len(circles)):
+            x, y = pose[0, k] + circles[n] * pose[2, k], pose[1, k] + circles[n] * pose[3, k]
+            u, v = (x - x0) / cell, (y - y0) / cell
+            if u >= 0.0 and v >= 0.0 and u < columns and v < rows:
+                c = int(u) * rows + int(v)
+                for q in range(offset[c], offset[c + 1]):
+                    if squared_distance(segment, member[q], x, y) <= radius * radius:
+                        return k
+    return pose.shape[1]

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
-from planning.boundary_kernel import touches
+from planning.boundary_kernel import first_line
 from planning.kinematics import GUARDED, MARGINS
 from planning.reference_kernel import line_at
-from planning.shapes import CELL, CLEARANCE
+from planning.shapes import CLEARANCE
 
 margins_of = MARGINS.scalar()
 clearance_of = CLEARANCE.scalar()
@@ -48,104 +49,181 @@ def polynomial(c, i, duration, t):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def along_line(coefficients, duration, table, step, dt, out):  # type: ignore[no-untyped-def]
-    """out (n, K, 9): s, s', s'', kappa, kappa', x, y, cos theta, sin theta of each motion at dt, 2 dt, ..."""
+    """out (n, 9, K): s, s', s'', kappa, kappa', x, y, cos theta, sin theta of each motion at dt, 2 dt, ..."""
     for i in range(out.shape[0]):
-        for k in range(out.shape[1]):
+        row = out[i]
+        for k in range(out.shape[2]):
             s, ds, dds = polynomial(coefficients, i, duration[i], (k + 1) * dt)
             x, y, theta, kappa, slope = line_at(table, step, s)
-            row = out[i, k]
-            row[0], row[1], row[2], row[3], row[4] = s, ds, dds, kappa, slope
-            row[5], row[6], row[7], row[8] = x, y, math.cos(theta), math.sin(theta)
+            row[0, k], row[1, k], row[2, k], row[3, k], row[4, k] = s, ds, dds, kappa, slope
+            row[5, k], row[6, k], row[7, k], row[8, k] = x, y, math.cos(theta), math.sin(theta)
 
 
 @njit(cache=True, error_model="numpy")
 def across_line(coefficients, duration, dt, out):  # type: ignore[no-untyped-def]
-    """out (m, K, 3): d, d', d'' of each motion told by time."""
+    """out (m, 3, K): d, d', d'' of each motion told by time."""
     for j in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            out[j, k, 0], out[j, k, 1], out[j, k, 2] = polynomial(coefficients, j, duration[j], (k + 1) * dt)
+        for k in range(out.shape[2]):
+            out[j, 0, k], out[j, 1, k], out[j, 2, k] = polynomial(coefficients, j, duration[j], (k + 1) * dt)
+
+
+@njit(error_model="numpy")
+def by_the_way(coefficients, j, way, a, start, out):  # type: ignore[no-untyped-def]
+    """out (3, K): d, d', d'' of a motion told by the way, on the longitudinal motion a (9, K)."""
+    for k in range(out.shape[1]):
+        d, slope, bend = polynomial(coefficients, j, way, a[0, k] - start)
+        out[0, k], out[1, k], out[2, k] = d, slope * a[1, k], bend * a[1, k] ** 2 + slope * a[2, k]
 
 
 @njit(error_model="numpy", inline="always")
-def limit_broken(ds, dds, kappa, slope, d, dd, ddd, limits):  # type: ignore[no-untyped-def]
-    """The first margin that is negative, counted from one, or 0; speed, curvature of the path."""
-    g = margins_of(ds, dds, kappa, slope, d, dd, ddd, limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
-    if min(min(min(g[0], g[1]), min(g[2], g[3])), min(min(g[4], g[5]), min(min(g[6], g[7]), min(g[8], g[9])))) >= 0.0:
-        return 0, g[10], g[11]
-    for n in range(10):
-        if not g[n] >= 0.0:  # NaN breaks it too
-            return n + 1, g[10], g[11]
-    return 0, g[10], g[11]
+def margins_at(a, d, k, limits):  # type: ignore[no-untyped-def]
+    """Margins, speed and curvature at step k."""
+    return margins_of(
+        a[1, k], a[2, k], a[3, k], a[4, k], d[0, k], d[1, k], d[2, k],
+        limits[0], limits[1], limits[2], limits[3], limits[4], limits[5],
+    )  # fmt: skip
 
 
-@njit(error_model="numpy", inline="always")
-def obstacle_touched(rectangles, k, x, y, cos, sin, middle, circles, radius):  # type: ignore[no-untyped-def]
-    """Whether a circle of the vehicle may touch a rectangle at step k, more likely than its chance allows."""
-    mx, my = x + middle * cos, y + middle * sin
-    for m in range(rectangles.shape[1]):
-        r = rectangles[k, m]
-        if (mx - r[0]) ** 2 + (my - r[1]) ** 2 > r[10]:
+@njit(error_model="numpy")
+def within(a, d, limits, speed, curvature):  # type: ignore[no-untyped-def]
+    """Whether all margins are kept (NaN keeps none); fills speed and curvature (K,). No branch: it runs on vectors."""
+    broken = 0
+    for k in range(len(speed)):
+        g = margins_at(a, d, k, limits)
+        kept = (g[0] >= 0.0) & (g[1] >= 0.0) & (g[2] >= 0.0) & (g[3] >= 0.0) & (g[4] >= 0.0)
+        kept &= (g[5] >= 0.0) & (g[6] >= 0.0) & (g[7] >= 0.0) & (g[8] >= 0.0) & (g[9] >= 0.0)
+        broken += 0 if kept else 1
+        speed[k], curvature[k] = g[10], g[11]
+    return broken == 0
+
+
+@njit(error_model="numpy")
+def first_limit(a, d, limits):  # type: ignore[no-untyped-def]
+    """The first margin that is not kept, counted from one, and its step."""
+    for k in range(a.shape[1]):
+        g = margins_at(a, d, k, limits)
+        for n in range(NUM_MARGINS):
+            if not g[n] >= 0.0:
+                return n + 1, k
+    return GOOD, a.shape[1]
+
+
+@njit(error_model="numpy")
+def first_turn(speed, curvature, start, most):  # type: ignore[no-untyped-def]
+    """The first step at which curvature has changed by more than `most` since the one before; K if none has. At a crawl
+    it may: steering at rest is free."""
+    if speed[0] > CRAWLING and abs(curvature[0] - start) > most:
+        return 0
+    turns = 0
+    for k in range(1, len(speed)):
+        quick = (speed[k] > CRAWLING) & (speed[k - 1] > CRAWLING)
+        turns += 1 if quick & (abs(curvature[k] - curvature[k - 1]) > most) else 0
+    if turns:
+        for k in range(1, len(speed)):
+            if min(speed[k], speed[k - 1]) > CRAWLING and abs(curvature[k] - curvature[k - 1]) > most:
+                return k
+    return len(speed)
+
+
+@njit(error_model="numpy")
+def in_plane(a, d, pose):  # type: ignore[no-untyped-def]
+    """pose (4, K): x, y, cos and sin of the heading."""
+    for k in range(pose.shape[1]):
+        ahead, aside = a[1, k] * (1.0 - a[3, k] * d[0, k]), d[1, k]
+        n = math.sqrt(ahead * ahead + aside * aside)
+        t0, t1 = (ahead / n, aside / n) if n > 1e-6 else (1.0, 0.0)
+        pose[0, k], pose[1, k] = a[5, k] - d[0, k] * a[8, k], a[6, k] + d[0, k] * a[7, k]
+        pose[2, k], pose[3, k] = a[7, k] * t0 - a[8, k] * t1, a[8, k] * t0 + a[7, k] * t1
+
+
+@njit(error_model="numpy")
+def first_rectangle(pose, rectangles, middle, circles, radius):  # type: ignore[no-untyped-def]
+    """The first step at which a circle may touch a rectangle, more likely than its chance allows, or K."""
+    first = pose.shape[1]
+    for m in range(rectangles.shape[0]):
+        r, near = rectangles[m], 0
+        for k in range(first):  # on vectors: most are far away
+            dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
+            near += 1 if dx * dx + dy * dy <= r[10, k] else 0
+        if near == 0:
             continue
-        for n in range(len(circles)):
-            px, py = x + circles[n] * cos, y + circles[n] * sin
-            if clearance_of(px, py, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], radius)[0] <= 0.0:
-                return True
-    return False
+        for k in range(first):
+            dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
+            if dx * dx + dy * dy > r[10, k]:
+                continue
+            least = 1.0
+            for n in range(len(circles)):
+                x, y = pose[0, k] + circles[n] * pose[2, k], pose[1, k] + circles[n] * pose[3, k]
+                clear = clearance_of(
+                    x,
+                    y,
+                    r[0, k],
+                    r[1, k],
+                    r[2, k],
+                    r[3, k],
+                    r[4, k],
+                    r[5, k],
+                    r[6, k],
+                    r[7, k],
+                    r[8, k],
+                    r[9, k],
+                    radius,
+                )
+                least = min(least, clear[0])
+            if least <= 0.0:
+                first = k
+                break
+    return first
+
+
+@njit(error_model="numpy")
+def first_touch(a, pose, end, stop, lines, rectangles, middle, circles, radius):  # type: ignore[no-untyped-def]
+    """The first thing that is passed or touched, and its step."""
+    num_steps = pose.shape[1]
+    found, at = GOOD, num_steps
+    if a[0, num_steps - 1] > min(stop, end):  # none drives backwards
+        at = 0
+        while not a[0, at] > min(stop, end):
+            at += 1
+        found = STOP_POINT if a[0, at] > stop else END_OF_LINE
+    k = first_line(pose, lines, circles, radius)
+    if k < at:
+        found, at = BOUNDARY, k
+    k = first_rectangle(pose, rectangles, middle, circles, radius)
+    return (OBSTACLE, k) if k < at else (found, at)
 
 
 @njit(cache=True, error_model="numpy")
 def judge(  # type: ignore[no-untyped-def]
-    order, ahead, across, by_way, bends, ways, start, dt, limits, rate, end, stop, stop_beyond, braking,
-    segment, origin, shape, offset, member, rectangles, middle, circles, radius, first_good, reason, when,
+    order, ahead, across, by_way, bends, ways, start, dt, limits, rate, end, stop, stand, braking,
+    lines, rectangles, middle, circles, radius, first_good, reason, when,
 ):  # fmt: skip
     """Fill reason (n m,) and when (n m,), the step at which it arises, of the candidates in `order`; return the first
-    good one, or -1.
+    good one, or -1. Limits come first, over the whole horizon, then what is touched.
 
-    ahead (n, K, 9) of along_line, across (m, K, 3) of across_line; by_way (m,): the lateral motion is told by way, with
-    coefficients bends (m, 6) and lengths ways (m,); start (s, curvature of the path); end, stop: largest s allowed;
-    stop_beyond: s at which standing must be possible by `braking` after the horizon; first_good: look no farther than
+    ahead (n, 9, K) of along_line, across (m, 3, K) of across_line; by_way (m,): the lateral motion is told by the way,
+    with coefficients bends (m, 6) and lengths ways (m,); start (s, curvature of the path); end, stop: largest s;
+    stand: s before which standing must be possible by `braking` after the horizon; first_good: look no farther than
     the first good one."""
-    num_lateral, num_steps = across.shape[0], across.shape[1]
+    num_lateral, num_steps = across.shape[0], across.shape[2]
+    speed, curvature = np.empty(num_steps), np.empty(num_steps)
+    told, pose = np.empty((3, num_steps)), np.empty((4, num_steps))
     for c in order:
         i, j = c // num_lateral, c % num_lateral
-        found, bent, k = 0, start[1], 0
-        for k in range(num_steps):
-            a = ahead[i, k]
-            s, ds, dds = a[0], a[1], a[2]
-            if by_way[j]:
-                d, slope, bend = polynomial(bends, j, ways[j], s - start[0])
-                dd, ddd = slope * ds, bend * ds * ds + slope * dds
-            else:
-                d, dd, ddd = across[j, k, 0], across[j, k, 1], across[j, k, 2]
-            found, v, curvature = limit_broken(ds, dds, a[3], a[4], d, dd, ddd, limits)
-            if found:
-                break
-            if v > CRAWLING:
-                if abs(curvature - bent) > rate * dt:
-                    found = CURVATURE_RATE
-                    break
-                bent = curvature
-            if s > end or s > stop:
-                found = STOP_POINT if s > stop else END_OF_LINE
-                break
-            w = 1.0 - a[3] * d
-            n = math.hypot(ds * w, dd)
-            t0, t1 = (ds * w / n, dd / n) if n > 1e-6 else (1.0, 0.0)
-            cos, sin = a[7] * t0 - a[8] * t1, a[8] * t0 + a[7] * t1
-            x, y = a[5] - d * a[8], a[6] + d * a[7]
-            for q in range(len(circles)):
-                px, py = x + circles[q] * cos, y + circles[q] * sin
-                if touches(segment, origin, shape, offset, member, CELL, px, py, radius):
-                    found = BOUNDARY
-                    break
-            if found:
-                break
-            if obstacle_touched(rectangles, k, x, y, cos, sin, middle, circles, radius):
-                found = OBSTACLE
-                break
-        if not found and ahead[i, num_steps - 1, 0] + ahead[i, num_steps - 1, 1] ** 2 / (2.0 * braking) > stop_beyond:
-            found, k = BEYOND, num_steps
+        a, d = ahead[i], across[j]
+        if by_way[j]:
+            by_the_way(bends, j, ways[j], a, start[0], told)
+            d = told
+        if not within(a, d, limits, speed, curvature):
+            found, k = first_limit(a, d, limits)
+        else:
+            found, k = CURVATURE_RATE, first_turn(speed, curvature, start[1], rate * dt)
+            if k == num_steps:
+                in_plane(a, d, pose)
+                found, k = first_touch(a, pose, end, stop, lines, rectangles, middle, circles, radius)
+                if found == GOOD and a[0, num_steps - 1] + a[1, num_steps - 1] ** 2 / (2.0 * braking) > stand:
+                    found = BEYOND
         reason[c], when[c] = found, k
-        if first_good and not found:
+        if first_good and found == GOOD:
             return c
     return -1

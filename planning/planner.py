@@ -196,7 +196,7 @@ def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, 
     across = candidates.lateral(
         scene.state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
     )
-    return _combined(planner, ahead, across)
+    return combined(planner, ahead, across)
 
 
 def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elapsed: float) -> Candidates:
@@ -211,7 +211,7 @@ def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elaps
     across = candidates.lateral(
         state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
     )
-    return _combined(planner, ahead, across)
+    return combined(planner, ahead, across)
 
 
 def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, first_good: bool = True) -> Candidates:
@@ -219,9 +219,9 @@ def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, f
     from planning import check_kernel as kernel
 
     vehicle, dt = planner.vehicle, planner.step
-    ahead = np.empty((len(made.longitudinal.cost), planner.num_steps, 9))
+    ahead = np.empty((len(made.longitudinal.cost), 9, planner.num_steps))
     kernel.along_line(*made.longitudinal.motion, scene.line.table, scene.line.step, dt, ahead)
-    across = np.empty((len(made.lateral.cost), planner.num_steps, 3))
+    across = np.empty((len(made.lateral.cost), 3, planner.num_steps))
     kernel.across_line(*made.lateral.motion, dt, across)
     reach = math.hypot(vehicle.length / 2, vehicle.width / 2) + planner.radius  # generous: circles stand out
     each = planner.risk / max(len(scene.obstacles.probability), 1)
@@ -240,7 +240,7 @@ def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, f
         scene.stop - vehicle.front,
         scene.stand - vehicle.front,
         limits.braking,
-        *scene.boundary[:5],
+        tuple(scene.boundary[:6]),
         scene.obstacles.table(each, planner.radius, reach),
         vehicle.middle,
         vehicle.circles,
@@ -300,7 +300,7 @@ def _rest(scene: Scene, previous: Plan | None, elapsed: float) -> tuple[Polynomi
     return previous.longitudinal.later(elapsed), lateral._replace(motion=lateral.motion.later(gone))
 
 
-def _combined(planner: Planner, ahead: Longitudinal, across: Lateral) -> Candidates:
+def combined(planner: Planner, ahead: Longitudinal, across: Lateral) -> Candidates:
     weights = planner.weights
     cost = (weights.longitudinal * ahead.cost[:, None] + weights.lateral * across.cost).ravel()
     unseen = np.full(cost.size, -1)

@@ -86,17 +86,17 @@ class Obstacles(NamedTuple):
     probability: Floats
 
     def table(self, risk: float, radius: float, reach: float) -> Floats:
-        """(K, M', 11): for each time and object p of CLEARANCE with radius left out, and the squared distance between
+        """(M', 11, K): for each object and time p of CLEARANCE with radius left out, and the squared distance between
         middles beyond which nothing can touch. Objects less likely than `risk` each are left out.
 
         risk    allowed for each object: probability * Phi(-z) = risk, z >= 0
         radius  of the vehicle's circles [m]
         reach   from the vehicle's middle to its farthest point [m]"""
-        from scipy.stats import norm
+        from scipy.special import ndtri
 
         kept = self.probability > risk
         pose, size, S = self.pose[kept], self.size[kept], self.covariance[kept]
-        z = np.maximum(norm.isf(risk / self.probability[kept]), 0.0)[:, None]  # (M', 1)
+        z = np.maximum(-ndtri(risk / self.probability[kept]), 0.0)[:, None]  # (M', 1)
         cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
         along = cos**2 * S[..., 0, 0] + 2 * cos * sin * S[..., 0, 1] + sin**2 * S[..., 1, 1]
         across = sin**2 * S[..., 0, 0] - 2 * cos * sin * S[..., 0, 1] + cos**2 * S[..., 1, 1]
@@ -105,7 +105,7 @@ class Obstacles(NamedTuple):
         widest = z * np.sqrt(np.linalg.eigvalsh(S)[..., 1]) if len(S) else np.zeros_like(cos)
         near = (np.hypot(half[..., 0], half[..., 1]) + reach + widest) ** 2
         told = [pose[..., 0], pose[..., 1], cos, sin, half[..., 0], half[..., 1], along, mixed, across]
-        return np.ascontiguousarray(np.stack([*told, np.broadcast_to(z, cos.shape), near], -1).transpose(1, 0, 2))
+        return np.ascontiguousarray(np.stack([*told, np.broadcast_to(z, cos.shape), near], 1))
 
 
 def no_obstacles(num_steps: int) -> Obstacles:
@@ -144,7 +144,8 @@ class Boundary(NamedTuple):
     segment  (N, 4) x, y of both ends
     origin   x, y of the grid's corner [m]
     shape    numbers of cells
-    offset   (cells + 1,), member  segments of cell c are member[offset[c]:offset[c + 1]]
+    offset   (cells + 1,), member: segments of cell c are member[offset[c]:offset[c + 1]]
+    cell     width of a cell [m]
     reach    [m]
     """
 
@@ -153,6 +154,7 @@ class Boundary(NamedTuple):
     shape: NDArray[np.int64]
     offset: NDArray[np.int64]
     member: NDArray[np.int64]
+    cell: float
     reach: float
 
 
@@ -174,11 +176,10 @@ def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, f
         length = np.hypot(*(segment[:, 2:] - segment[:, :2]).T)
         segment = segment[np.hypot(segment[:, 0] - x, segment[:, 1] - y) <= r + length]
     if not len(segment):
-        return Boundary(
-            segment, np.zeros(2), np.zeros(2, np.int64), np.zeros(1, np.int64), np.zeros(0, np.int64), reach
-        )
+        none = np.zeros(0, np.int64)
+        return Boundary(segment, np.zeros(2), np.zeros(2, np.int64), np.zeros(1, np.int64), none, CELL, reach)
     ends = segment.reshape(-1, 2)
     origin = ends.min(0) - reach - CELL
     shape = np.ceil((ends.max(0) + reach + CELL - origin) / CELL).astype(np.int64)
     offset, member = bucket(segment, origin, shape, CELL, reach)
-    return Boundary(np.ascontiguousarray(segment), origin, shape, offset, member, reach)
+    return Boundary(np.ascontiguousarray(segment), origin, shape, offset, member, CELL, reach)

@@ -111,14 +111,13 @@ def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) ->
     rectangles = given.obstacles.table(planner.risk / max(len(given.obstacles.pose), 1), radius, 10.0)
     from planning.frenet import to_pose
 
-    bent = to_pose(given.line, given.state).curvature
+    if (margins[:, :10] < 0).any():
+        return REASONS[1 + int(np.argmax(margins[np.argmax((margins[:, :10] < 0).any(1)), :10] < 0))]
+    quick = np.r_[True, margins[:-1, 10] > 0.1] & (margins[:, 10] > 0.1)
+    turned = np.abs(np.diff(np.r_[to_pose(given.line, given.state).curvature, curvature]))
+    if (quick & (turned > limits.curvature_rate * planner.step)).any():
+        return "curvature rate"
     for k in range(planner.num_steps):
-        if (margins[k, :10] < 0).any():
-            return REASONS[1 + int(np.argmax(margins[k, :10] < 0))]
-        if margins[k, 10] > 0.1:
-            if abs(curvature[k] - bent) > limits.curvature_rate * planner.step:
-                return "curvature rate"
-            bent = curvature[k]
         if s[k] > given.stop - vehicle.front:
             return "stop point"
         if s[k] > given.line.length:
@@ -126,7 +125,7 @@ def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) ->
         centres = xy[k] + vehicle.circles[:, None] * [np.cos(heading[k]), np.sin(heading[k])]
         if (shapely.distance(shapely.points(centres), lines) <= radius).any():
             return "boundary line"
-        for r in rectangles[k]:
+        for r in rectangles[..., k]:
             if (CLEARANCE(centres, np.array([[*r[:10], radius]])) <= 0).any():
                 return "other road user"
     if s[-1] + ds[-1] ** 2 / (2 * limits.braking) > given.stand - vehicle.front:
@@ -185,7 +184,7 @@ def test_a_parked_car_is_passed_beside() -> None:
         assert previous.clear
         x, y, heading = previous.trajectory([0.15])[0, :3]
         centres = np.array([x, y]) + PLANNER.vehicle.circles[:, None] * [math.cos(heading), math.sin(heading)]
-        r = given.obstacles.table(1e-3, 1.0, 1.0)[0, 0]
+        r = given.obstacles.table(1e-3, 1.0, 1.0)[0, :, 0]
         gap = CLEARANCE(centres, np.array([[*r[:9], 0.0, 0.0]])).min() ** 0.5
         clearance, state = min(clearance, gap - PLANNER.vehicle.radius), previous.states([0.15])[0]
     assert state.s > 80.0 and clearance >= PLANNER.margin - 0.05

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from shapely import affinity
 
 from models.program import InputError
-from planning.boundary_kernel import touches
-from planning.shapes import CELL, CLEARANCE, Boundary, Obstacles, Vehicle, boundary
+from planning.boundary_kernel import first_line
+from planning.shapes import CLEARANCE, Boundary, Obstacles, Vehicle, boundary
 
 VEHICLE = Vehicle()
 
@@ -43,7 +43,7 @@ def test_the_distance_to_a_rectangle_is_shapelys_and_no_collision_is_missed(
     x: float, y: float, heading: float, length: float, width: float
 ) -> None:
     body = Obstacles(np.array([[[x, y, heading]]]), np.array([[length, width]]), np.zeros((1, 1, 2, 2)), np.ones(1))
-    row = body.table(1e-3, VEHICLE.radius, 5.0)[0, 0]
+    row = body.table(1e-3, VEHICLE.radius, 5.0)[0, :, 0]
     shape = rectangle(x, y, heading, length, width)
     centres = np.stack([VEHICLE.circles, np.zeros(3)], -1)
     gaps = shapely.distance(shapely.points(centres), shape)
@@ -64,7 +64,7 @@ def test_a_chance_constraint_at_its_limit_is_kept_in_simulation() -> None:
             body = Obstacles(
                 np.array([[[0.0, 0.0, 0.4]]]), np.array([[4.0, 2.0]]), np.array([[covariance]]), np.ones(1)
             )
-            row = body.table(0.05, 1.0, 5.0)[0, 0]
+            row = body.table(0.05, 1.0, 5.0)[0, :, 0]
             far = np.linspace(0.0, 8.0, 4001)[:, None] * [math.cos(bearing), math.sin(bearing)]
             centre = far[np.flatnonzero(margins(row, far, 1.0) <= 0)[-1] + 1]
             moved = centre - rng.multivariate_normal([0, 0], covariance, 40000)
@@ -78,8 +78,8 @@ def test_unlikely_objects_get_a_larger_chance_each_and_the_unlikeliest_none() ->
     same = Obstacles(
         np.zeros((3, 1, 3)), np.ones((3, 2)), np.full((3, 1, 2, 2), np.eye(2)), np.array([1.0, 0.1, 0.009])
     )
-    rows = same.table(0.01, 1.0, 1.0)[0]
-    np.testing.assert_allclose(rows[:, 9], [2.326347874, 1.281551566], atol=1e-8)
+    rows = same.table(0.01, 1.0, 1.0)
+    np.testing.assert_allclose(rows[:, 9, 0], [2.326347874, 1.281551566], atol=1e-8)
 
 
 def wire(seed: int) -> list[np.ndarray]:
@@ -88,7 +88,8 @@ def wire(seed: int) -> list[np.ndarray]:
 
 
 def hit(lines: Boundary, x: float, y: float, radius: float) -> bool:
-    return bool(touches(*lines[:5], CELL, x, y, radius))
+    pose = np.array([[x, x], [y, y], [1.0, 1.0], [0.0, 0.0]])
+    return bool(first_line(pose, tuple(lines[:6]), np.zeros(1), radius) == 0)
 
 
 @pytest.mark.parametrize("seed", range(3))

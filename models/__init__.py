@@ -6,6 +6,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+PACKAGES = ("models", "inference", "planning")  # those with machine code
+
 
 def _compiled_code_folder() -> str:
     """One folder of compiled code for each state of the sources.
@@ -15,7 +17,7 @@ def _compiled_code_folder() -> str:
     are kept (cache=True): one that is loaded from the disk cannot be inlined into its machine-code callers."""
     root = Path(__file__).resolve().parent.parent
     digest = hashlib.sha256()
-    for path in sorted(p for package in ("models", "inference") for p in (root / package).rglob("*.py")):
+    for path in sorted(p for package in PACKAGES for p in (root / package).rglob("*.py")):
         digest.update(path.read_bytes())
     home = root if os.access(root, os.W_OK) else Path(tempfile.gettempdir())
     return str(home / ".compiled" / digest.hexdigest()[:12])

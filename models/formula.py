@@ -7,6 +7,7 @@ else, no branch (`ops.where` chooses, both sides being evaluated). So it can be 
 
     casadi()    a CasADi function, for optimisers and for exact derivatives of any order
     compiled()  straight-line machine code for N points at once, with the Jacobian dy/dx where asked for
+    scalar()    the same for one point, of scalars: for the inner loops of other machine code
     torch()     on tensors, differentiable: for programs and tests
 
 Emitted code is a source file named by its own hash beside numba's cache, so that machine code is found again by the
@@ -96,6 +97,11 @@ class Formula:
         machine code is known for."""
         return _compiled(self, jacobian)
 
+    def scalar(self) -> Callable[..., tuple[float, ...]]:
+        """Machine code `f(x0, x1, ..., p0, p1, ...) -> (y0, y1, ...)`, to be called by (and inlined into) other machine
+        code, of which it is a global name. Raises InputError for an operation that no machine code is known for."""
+        return _scalar(self)
+
     def __call__(self, x: Any, p: Any) -> Any:
         """y (N, d) of x (N, n) and p (N, m) or (1, m), in machine code."""
         import numpy as np
@@ -148,10 +154,21 @@ def _traced(formula: Formula) -> Any:
 
 @lru_cache
 def _compiled(formula: Formula, jacobian: bool) -> Callable[..., None]:
-    source = emit(formula, jacobian=jacobian)
+    fill: Callable[..., None] = _loaded(formula.name, emit(formula, jacobian=jacobian)).fill
+    return fill
+
+
+@lru_cache
+def _scalar(formula: Formula) -> Callable[..., tuple[float, ...]]:
+    value: Callable[..., tuple[float, ...]] = _loaded(f"{formula.name}_scalar", emit_scalar(formula)).value
+    return value
+
+
+def _loaded(name: str, source: str) -> Any:
+    """The module of that source, from a file named by its hash."""
     digest = hashlib.sha256(source.encode()).hexdigest()[:16]
     folder = Path(os.environ["NUMBA_CACHE_DIR"]) / "formulas"
-    path = folder / f"{formula.name}_{digest}.py"
+    path = folder / f"{name}_{digest}.py"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         draft = path.with_suffix(f".{os.getpid()}")
@@ -162,37 +179,23 @@ def _compiled(formula: Formula, jacobian: bool) -> Callable[..., None]:
     module = importlib.util.module_from_spec(spec)
     sys.modules[path.stem] = module  # numba finds the home of cached machine code there
     spec.loader.exec_module(module)
-    fill: Callable[..., None] = module.fill
-    return fill
+    return module
 
 
 def emit(formula: Formula, *, jacobian: bool) -> str:
-    """The source of the machine code. Raises InputError for an operation without a spelling."""
+    """The source of the machine code for many points. Raises InputError for an operation without a spelling."""
     import casadi
 
-    spelling = {getattr(casadi, name): text for name, text in SPELLING.items()}
-    traced = _traced(formula)
-    x, p = casadi.SX.sym("x", formula.num_x), casadi.SX.sym("p", formula.num_p)
-    y = traced(x, p)
+    x, p, y = _symbols(formula)
     outputs = [y, casadi.densify(casadi.jacobian(y, x))] if jacobian else [y]
-    f = casadi.Function("f", [x, p], casadi.cse(outputs))
-    rows = f.size1_out(0)
-    body = list[str]()
-    for i in range(f.n_instructions()):
-        code, inputs, out = f.instruction_id(i), f.instruction_input(i), f.instruction_output(i)
-        if code == casadi.OP_CONST:
-            value = repr(float(f.instruction_constant(i)))
-            body.append(f"w{out[0]} = " + value.replace("inf", "math.inf").replace("nan", "math.nan"))
-        elif code == casadi.OP_INPUT:
-            body.append(f"w{out[0]} = " + (f"x[i, {inputs[1]}]" if inputs[0] == 0 else f"p[i * own, {inputs[1]}]"))
-        elif code == casadi.OP_OUTPUT:
-            place = f"y[i, {out[1]}]" if out[0] == 0 else f"J[i, {out[1] % rows}, {out[1] // rows}]"
-            body.append(f"{place} = w{inputs[0]}")
-        elif code in spelling:
-            body.append(f"w{out[0]} = " + spelling[code].format(*(f"w{k}" for k in inputs)))
-        else:
-            name = next((n for n in dir(casadi) if n.startswith("OP_") and getattr(casadi, n) == code), str(code))
-            raise InputError(f"formula {formula.name} uses CasADi's {name}, which has no machine code; rewrite it")
+    rows = y.shape[0]
+
+    def given(which: int, entry: int) -> str:
+        return f"x[i, {entry}]" if which == 0 else f"p[i * own, {entry}]"
+
+    def place(which: int, entry: int) -> str:
+        return f"y[i, {entry}]" if which == 0 else f"J[i, {entry % rows}, {entry // rows}]"
+
     matrix = "float64[:, ::1]"
     types = ", ".join([matrix] * 3 + ["float64[:, :, ::1]"] * jacobian)
     return "\n".join(
@@ -206,7 +209,66 @@ def emit(formula: Formula, *, jacobian: bool) -> str:
             f"def fill(x, p, y{', J' if jacobian else ''}):",
             "    own = 1 if p.shape[0] > 1 else 0  # a row of parameters for each point, or one for all",
             "    for i in range(x.shape[0]):",
-            *(f"        {line}" for line in body),
+            *(f"        {line}" for line in _lines(formula.name, [x, p], outputs, given, place)),
             "",
         ]
     )
+
+
+def emit_scalar(formula: Formula) -> str:
+    """The source of the machine code for one point. Raises InputError for an operation without a spelling.
+
+    Not kept on the disk by itself: what is loaded from there cannot be inlined; it is part of its callers' code."""
+    x, p, y = _symbols(formula)
+
+    def given(which: int, entry: int) -> str:
+        return f"{'xp'[which]}{entry}"
+
+    names = [given(0, k) for k in range(formula.num_x)] + [given(1, k) for k in range(formula.num_p)]
+    return "\n".join(
+        [
+            "import math",
+            "",
+            "from numba import njit",
+            "",
+            "",
+            '@njit(error_model="numpy")',
+            f"def value({', '.join(names)}):",
+            *(f"    {line}" for line in _lines(formula.name, [x, p], [y], given, lambda which, entry: f"y{entry}")),
+            f"    return ({', '.join(f'y{k}' for k in range(y.shape[0]))},)",
+            "",
+        ]
+    )
+
+
+def _symbols(formula: Formula) -> tuple[Any, Any, Any]:
+    import casadi
+
+    x, p = casadi.SX.sym("x", formula.num_x), casadi.SX.sym("p", formula.num_p)
+    return x, p, _traced(formula)(x, p)
+
+
+def _lines(
+    name: str, inputs: list[Any], outputs: list[Any], given: Callable[[int, int], str], place: Callable[[int, int], str]
+) -> list[str]:
+    """A line of source for each operation; `given` and `place` name the entries of inputs and outputs."""
+    import casadi
+
+    spelling = {getattr(casadi, operation): text for operation, text in SPELLING.items()}
+    f = casadi.Function("f", inputs, casadi.cse(outputs))
+    body = list[str]()
+    for i in range(f.n_instructions()):
+        code, read, out = f.instruction_id(i), f.instruction_input(i), f.instruction_output(i)
+        if code == casadi.OP_CONST:
+            value = repr(float(f.instruction_constant(i)))
+            body.append(f"w{out[0]} = " + value.replace("inf", "math.inf").replace("nan", "math.nan"))
+        elif code == casadi.OP_INPUT:
+            body.append(f"w{out[0]} = {given(read[0], read[1])}")
+        elif code == casadi.OP_OUTPUT:
+            body.append(f"{place(out[0], out[1])} = w{read[0]}")
+        elif code in spelling:
+            body.append(f"w{out[0]} = " + spelling[code].format(*(f"w{k}" for k in read)))
+        else:
+            found = next((n for n in dir(casadi) if n.startswith("OP_") and getattr(casadi, n) == code), str(code))
+            raise InputError(f"formula {name} uses CasADi's {found}, which has no machine code; rewrite it")
+    return body

@@ -127,3 +127,20 @@ def test_processes_may_emit_the_same_formula_at_once(tmp_path: Any) -> None:
     both = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) for _ in range(2)]
     assert [process.communicate(timeout=120)[0].strip() for process in both] == ["1.0", "1.0"]
     assert len(list((tmp_path / "formulas").glob("shared_*.py"))) == 1
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_one_point_inside_other_machine_code_is_the_same(name: str) -> None:
+    from numba import njit
+
+    formula = Formula(name, with_parameter(EACH[name]), 2, 1)
+    value = formula.scalar()
+
+    @njit
+    def doubled(a: float, b: float, p: float) -> tuple[float, ...]:
+        y = value(a, b, p)
+        return 2 * y[0], 2 * y[1], 2 * y[2]
+
+    for x in POINTS:
+        expected = 2 * formula(x[None], np.array([[0.7]]))[0]
+        np.testing.assert_allclose(doubled(x[0], x[1], 0.7), expected, rtol=1e-14)

@@ -23,10 +23,11 @@ ALLOWED = {
         "models.formula",
         "models.multi_object",
     },
-    "experiments": {"experiments", "inference", "models"},
-    "benchmarks": {"benchmarks", "experiments", "inference", "models"},
+    "planning": {"planning", "models.clothoid", "models.frame", "models.formula", "models.program"},
+    "experiments": {"experiments", "inference", "models", "planning"},
+    "benchmarks": {"benchmarks", "experiments", "inference", "models", "planning"},
 }
-OURS = {"models", "inference", "experiments", "configs", "benchmarks", "tests", "examples"}
+OURS = {"models", "inference", "planning", "experiments", "configs", "benchmarks", "tests", "examples"}
 
 
 def imports_of(file: Path) -> Iterator[str]:

@@ -1,0 +1,331 @@
+"""One planning cycle: candidates, cheapest first, judged until one is good; there is always an answer.
+
+    comfort      the cheapest candidate within the vehicle's comfortable limits, clear of everything
+    relaxed      the same within what the vehicle can do
+    emergency    a stop: the cheapest that is clear, else the one that is slowest where it touches something
+
+[K15], section IV-C: horizon 3 s, 20 Hz, every 150 ms; |a_lat| <= 2 m/s^2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.program import InputError
+from planning import candidates
+from planning.candidates import Fans, Goal, Keep, Lateral, Longitudinal, Weights
+from planning.frenet import FrenetState, to_pose
+from planning.kinematics import LIMITS, Limits
+from planning.polynomials import Polynomials, quartics
+from planning.reference import ReferenceLine
+from planning.shapes import Boundary, Obstacles, Vehicle, check_obstacles
+
+Floats = NDArray[np.float64]
+COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
+ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
+SLOWEST = 0.05  # [m/s] above which a motion told by time tells a direction
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Settings of a planner.
+
+    horizon, step   [s] of what is judged
+    comfort, able   limits of ordinary plans, and of what the vehicle can do at all
+    risk            allowed probability of touching other road users within a plan, shared among them
+    margin          kept clear around the vehicle, of boundary lines and of road users [m]
+    """
+
+    vehicle: Vehicle = field(default_factory=Vehicle)
+    comfort: Limits = field(default_factory=Limits)
+    able: Limits = field(
+        default_factory=lambda: Limits(acceleration=4.0, braking=8.0, lateral_acceleration=5.0, curvature_rate=0.4)
+    )
+    weights: Weights = field(default_factory=Weights)
+    fans: Fans = field(default_factory=Fans)
+    horizon: float = 3.0
+    step: float = 0.05
+    risk: float = 1e-3
+    margin: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "step", "risk"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"planner: {name} is {getattr(self, name)}, but must be positive and finite")
+        for name in LIMITS:
+            if getattr(self.able, name) < getattr(self.comfort, name):
+                raise InputError(
+                    f"planner: comfort.{name} is {getattr(self.comfort, name)}, more than the vehicle can: "
+                    f"able.{name} is {getattr(self.able, name)}"
+                )
+        if self.margin < 0:
+            raise InputError(f"planner: margin is {self.margin}, but must be 0 or more [m]")
+
+    @property
+    def num_steps(self) -> int:
+        return round(self.horizon / self.step)
+
+    @property
+    def radius(self) -> float:
+        """Of the vehicle's circles with their margin [m]."""
+        return self.vehicle.radius + self.margin
+
+
+class Scene(NamedTuple):
+    """What a cycle plans in.
+
+    line      the reference line; state along it
+    goal      along the line
+    offsets   (N,) targets of the offset, and the one wanted [m]
+    boundary  lines not to touch (planning.shapes.boundary, with the planner's radius)
+    obstacles predicted at the horizon's steps
+    stop      arc length that the vehicle's front must not pass, e.g. a line without permission [m]
+    stand     arc length before which the front must be able to stand after the horizon [m]
+    """
+
+    line: ReferenceLine
+    state: FrenetState
+    goal: Goal
+    offsets: Floats
+    wanted: float
+    boundary: Boundary
+    obstacles: Obstacles
+    stop: float = math.inf
+    stand: float = math.inf
+
+
+class Candidates(NamedTuple):
+    """All n x m of them, cheapest first in `order`; `reason` each is bad for (planning.check_kernel.REASONS), -1 where
+    none was asked for; `when` it arises [steps]; `best` the cheapest good one, or -1."""
+
+    longitudinal: Longitudinal
+    lateral: Lateral
+    cost: Floats
+    order: NDArray[np.int64]
+    reason: NDArray[np.int64]
+    when: NDArray[np.int64]
+    best: int
+
+
+class Plan(NamedTuple):
+    """A motion from `start` on and how it was come by.
+
+    tier       comfort, relaxed, emergency
+    clear      whether it breaks nothing within the horizon (an emergency stop may)
+    cost       of its candidate
+    rejected   {reason: how many cheaper candidates were turned down for it}
+    """
+
+    line: ReferenceLine
+    start: FrenetState
+    longitudinal: Polynomials
+    lateral: Lateral
+    tier: str
+    clear: bool
+    cost: float
+    rejected: dict[str, int]
+    candidates: Candidates
+
+    def along(self, t: Floats) -> Floats:
+        """s, s', s'' (K, 3), never backwards."""
+        told = self.longitudinal.at(t)[0]
+        still = (told[:, 1] < 0.0) | (np.maximum.accumulate(told[:, 0]) > told[:, 0])
+        told[:, 0] = np.maximum.accumulate(told[:, 0])
+        told[still, 1:] = 0.0
+        return told
+
+    def states(self, t: Sequence[float] | Floats) -> list[FrenetState]:
+        """Where the vehicle is along the line at times t after the start."""
+        along = self.along(np.asarray(t, float))
+        if self.lateral.by_way[0]:
+            across = self.lateral.motion.at(along[:, 0] - self.start.s)[0]
+            return [FrenetState(*map(float, (*a, *d))) for a, d in zip(along, across, strict=True)]
+        across = self.lateral.motion.at(np.asarray(t, float))[0]
+        return [_by_way(a, d) for a, d in zip(along, across, strict=True)]
+
+    def trajectory(self, t: Sequence[float] | Floats) -> Floats:
+        """x, y, heading, speed, acceleration, curvature (K, 6) at times t after the start."""
+        return np.array([to_pose(self.line, state) for state in self.states(t)])
+
+
+def _by_way(along: Floats, across: Floats) -> FrenetState:
+    s, ds, dds = map(float, along)
+    d, dd, ddd = map(float, across)
+    if ds < SLOWEST:
+        return FrenetState(s, ds, dds, d)
+    slope = dd / ds
+    return FrenetState(s, ds, dds, d, slope, (ddd - slope * dds) / ds**2)
+
+
+def plan(
+    planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0, *, all_reasons: bool = False
+) -> Plan:
+    """The plan of a cycle.
+
+    previous, elapsed  the last plan on the same line and the time since its start [s]: its rest is a candidate
+    all_reasons        judge every candidate, not only those cheaper than the best: for pictures
+
+    Raises InputError for a scene that is not one (shapes, NaN); anything else is answered with a plan."""
+    check(planner, scene)
+    made = candidates_of(planner, scene, previous, elapsed)
+    judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
+    rejected = turned_down(judged)
+    if judged.best >= 0:
+        return _chosen(scene, judged, judged.best, COMFORT, rejected)
+    relaxed = judge(planner, scene, made, planner.able)
+    if relaxed.best >= 0:
+        return _chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
+    stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able)
+    best = stops.best if stops.best >= 0 else least_harm(planner, stops)
+    return _chosen(scene, stops, best, EMERGENCY, rejected)
+
+
+def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0) -> Candidates:
+    """All motions of a scene, and the rest of the previous plan if the vehicle is where that plan wanted it."""
+    rest = _rest(scene, previous, elapsed)
+    ahead = candidates.longitudinal(
+        scene.state, scene.goal, planner.fans, planner.weights, None if rest is None else rest[0]
+    )
+    across = candidates.lateral(
+        scene.state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
+    )
+    return combined(planner, ahead, across)
+
+
+def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elapsed: float) -> Candidates:
+    """Stops within what the vehicle can do, from as hard as that on, on any lateral motion.
+
+    A quartic from v to rest in T brakes by 3 v / 2 T at most (from a = 0)."""
+    state, rest = scene.state, _rest(scene, previous, elapsed)
+    shortest = max(1.5 * state.ds / planner.able.braking, planner.fans.cycle)
+    duration = shortest * np.array([1.0, 1.15, 1.4, 1.8, 2.5, 4.0])
+    motion = quartics((state.s, state.ds, state.dds), np.zeros_like(duration), duration)
+    ahead = Longitudinal(motion, candidates.longitudinal_cost(motion, Keep(0.0), planner.weights))
+    across = candidates.lateral(
+        state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
+    )
+    return combined(planner, ahead, across)
+
+
+def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, first_good: bool = True) -> Candidates:
+    """Candidates with reasons, cheapest first, up to the first good one (all of them unless `first_good`)."""
+    from planning import check_kernel as kernel
+
+    vehicle, dt = planner.vehicle, planner.step
+    ahead = np.empty((len(made.longitudinal.cost), 9, planner.num_steps))
+    kernel.along_line(*made.longitudinal.motion, scene.line.table, scene.line.step, dt, ahead)
+    across = np.empty((len(made.lateral.cost), 3, planner.num_steps))
+    kernel.across_line(*made.lateral.motion, dt, across)
+    reach = math.hypot(vehicle.length / 2, vehicle.width / 2) + planner.radius  # generous: circles stand out
+    each = planner.risk / max(len(scene.obstacles.probability), 1)
+    reason, when = np.full(made.cost.size, -1), np.zeros(made.cost.size, np.int64)
+    best = kernel.judge(
+        made.order,
+        ahead,
+        across,
+        made.lateral.by_way,
+        *made.lateral.motion,
+        np.array([scene.state.s, to_pose(scene.line, scene.state).curvature]),
+        dt,
+        np.array([getattr(limits, name) for name in LIMITS]),
+        limits.curvature_rate,
+        scene.line.length,
+        scene.stop - vehicle.front,
+        scene.stand - vehicle.front,
+        limits.braking,
+        tuple(scene.boundary[:6]),
+        scene.obstacles.table(each, planner.radius, reach),
+        vehicle.middle,
+        vehicle.circles,
+        planner.radius,
+        first_good,
+        reason,
+        when,
+    )
+    return made._replace(best=best, reason=reason, when=when)
+
+
+def turned_down(judged: Candidates) -> dict[str, int]:
+    """{reason: how many candidates cheaper than the best were turned down for it}"""
+    from planning.check_kernel import REASONS
+
+    rank = np.flatnonzero(judged.order == judged.best)
+    cheaper = judged.order[: rank[0]] if len(rank) else judged.order
+    return dict(Counter(REASONS[reason] for reason in judged.reason[cheaper]).most_common())
+
+
+def check(planner: Planner, scene: Scene) -> None:
+    """Raises InputError for a scene that no plan can be made for, in words."""
+    for name, value in zip(scene.state._fields, scene.state, strict=True):
+        if not math.isfinite(value):
+            raise InputError(f"the vehicle's state has {name} = {value}")
+    if not 0.0 <= scene.state.s <= scene.line.length:
+        raise InputError(
+            f"the vehicle is at s {scene.state.s:.1f} m of a line from 0 to {scene.line.length:.1f} m; "
+            "choose a longer one"
+        )
+    if not all(map(math.isfinite, scene.goal)):
+        raise InputError(f"the goal {scene.goal} is not finite")
+    if not len(scene.offsets) or not np.isfinite(scene.offsets).all() or not math.isfinite(scene.wanted):
+        raise InputError(
+            f"offsets to drive to are {np.asarray(scene.offsets).tolist()}, but must be one or more numbers"
+        )
+    if scene.boundary.reach < planner.radius:
+        raise InputError(
+            f"boundary lines are known to {scene.boundary.reach:.2f} m, but the vehicle's circles reach "
+            f"{planner.radius:.2f} m; build them with that reach"
+        )
+    for name in ("stop", "stand"):
+        if math.isnan(getattr(scene, name)):
+            raise InputError(f"scene: {name} is NaN; infinity means none")
+    check_obstacles(scene.obstacles, planner.num_steps)
+
+
+def _rest(scene: Scene, previous: Plan | None, elapsed: float) -> tuple[Polynomials, Lateral] | None:
+    """What is left of the previous plan, where the vehicle is on it and its line is this one."""
+    if previous is None or previous.line.table is not scene.line.table:
+        return None
+    planned = previous.states([elapsed])[0]
+    if not np.allclose(planned, scene.state, rtol=0.0, atol=ON_PLAN):
+        return None
+    lateral = previous.lateral
+    gone = planned.s - previous.start.s if lateral.by_way[0] else elapsed
+    return previous.longitudinal.later(elapsed), lateral._replace(motion=lateral.motion.later(gone))
+
+
+def combined(planner: Planner, ahead: Longitudinal, across: Lateral) -> Candidates:
+    weights = planner.weights
+    cost = (weights.longitudinal * ahead.cost[:, None] + weights.lateral * across.cost).ravel()
+    unseen = np.full(cost.size, -1)
+    return Candidates(ahead, across, cost, np.argsort(cost, kind="stable"), unseen, unseen, -1)
+
+
+def least_harm(planner: Planner, judged: Candidates) -> int:
+    """Of candidates that are all bad: one that can be driven, then the slowest at the step that breaks something, then
+    the cheapest."""
+    from planning.check_kernel import BOUNDARY
+
+    t = planner.step * np.arange(1, planner.num_steps + 2)
+    speed = judged.longitudinal.motion.at(t)[..., 1]
+    i = np.arange(judged.cost.size) // len(judged.lateral.cost)
+    return int(np.lexsort((judged.cost, speed[i, judged.when], judged.reason < BOUNDARY))[0])
+
+
+def _chosen(scene: Scene, judged: Candidates, best: int, tier: str, rejected: dict[str, int]) -> Plan:
+    i, j = divmod(best, len(judged.lateral.cost))
+    ahead = judged.longitudinal.motion.take([i])
+    across = Lateral(
+        judged.lateral.motion.take([j]),
+        judged.lateral.by_way[[j]],
+        judged.lateral.target[[j]],
+        judged.lateral.cost[[j]],
+    )
+    cost = float(judged.cost[best])
+    return Plan(scene.line, scene.state, ahead, across, tier, judged.best >= 0, cost, rejected, judged)

@@ -1,0 +1,185 @@
+"""What must not touch: the vehicle as circles, other road users as rectangles of uncertain place, boundary lines.
+
+Circles after Ziegler and Stiller (2010): n equal ones along the vehicle that cover its rectangle. A circle of radius R
+at c and a rectangle whose nearest point is c - q are apart by |q| - R. Where the rectangle's place is wrong by
+e ~ N(0, S), they can touch only if e . q / |q| >= |q| - R, so
+
+    P(touch) <= Phi(-(|q| - R) / sigma),   sigma^2 = q' S q / |q|^2
+
+and the chance constraint P <= Phi(-z) holds where |q| - R >= z sigma. Without uncertainty it is the distance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from models.formula import Formula
+from models.program import InputError
+
+Floats = NDArray[np.float64]
+CELL = 1.0  # of the grid in which segments of boundary lines are found [m]
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A rectangle of length and width [m]; its middle lies `middle` ahead of the rear axle [m]."""
+
+    length: float = 4.9
+    width: float = 1.9
+    middle: float = 1.4
+    num_circles: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("length", "width", "num_circles"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"vehicle: {name} is {getattr(self, name)}, but must be positive and finite")
+
+    @property
+    def front(self) -> float:
+        """From the rear axle to the front [m]."""
+        return self.middle + self.length / 2
+
+    @property
+    def circles(self) -> Floats:
+        """(n,) their middles, ahead of the rear axle [m]."""
+        return self.middle + self.length * ((np.arange(self.num_circles) + 0.5) / self.num_circles - 0.5)
+
+    @property
+    def radius(self) -> float:
+        """[m], the least with which they cover the rectangle."""
+        return math.hypot(self.length / 2 / self.num_circles, self.width / 2)
+
+
+def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
+    px, py = x
+    ox, oy, cos, sin, half_length, half_width, along, mixed, across, z, radius = p
+    ahead, left = (px - ox) * cos + (py - oy) * sin, (py - oy) * cos - (px - ox) * sin
+    qx = ahead - ops.fmin(ops.fmax(ahead, -half_length), half_length)
+    qy = left - ops.fmin(ops.fmax(left, -half_width), half_width)
+    squared = qx * qx + qy * qy
+    spread = qx * qx * along + 2 * qx * qy * mixed + qy * qy * across
+    return (squared - radius * ops.sqrt(squared) - z * ops.sqrt(spread),)
+
+
+# |q| (|q| - R - z sigma), positive where a circle at x is clear of a rectangle; covariance in the rectangle's frame
+CLEARANCE = Formula("clearance", _clearance, 2, 11)
+
+
+class Obstacles(NamedTuple):
+    """M rectangles at K times, the horizon's steps without the first, and how likely each is met.
+
+    pose         (M, K, 3) x, y, heading
+    size         (M, 2) length, width [m]
+    covariance   (M, K, 2, 2) of x, y, in the plane's axes [m^2]
+    probability  (M,) that there is such an object and that it moves this way
+    """
+
+    pose: Floats
+    size: Floats
+    covariance: Floats
+    probability: Floats
+
+    def table(self, risk: float, radius: float, reach: float) -> Floats:
+        """(M', 11, K): for each object and time p of CLEARANCE with radius left out, and the squared distance between
+        middles beyond which nothing can touch. Objects less likely than `risk` each are left out.
+
+        risk    allowed for each object: probability * Phi(-z) = risk, z >= 0
+        radius  of the vehicle's circles [m]
+        reach   from the vehicle's middle to its farthest point [m]"""
+        from scipy.special import ndtri
+
+        kept = self.probability > risk
+        pose, size, S = self.pose[kept], self.size[kept], self.covariance[kept]
+        z = np.maximum(-ndtri(risk / self.probability[kept]), 0.0)[:, None]  # (M', 1)
+        cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        along = cos**2 * S[..., 0, 0] + 2 * cos * sin * S[..., 0, 1] + sin**2 * S[..., 1, 1]
+        across = sin**2 * S[..., 0, 0] - 2 * cos * sin * S[..., 0, 1] + cos**2 * S[..., 1, 1]
+        mixed = cos * sin * (S[..., 1, 1] - S[..., 0, 0]) + (cos**2 - sin**2) * S[..., 0, 1]
+        half = np.broadcast_to(size[:, None] / 2, (*cos.shape, 2))
+        widest = z * np.sqrt(np.linalg.eigvalsh(S)[..., 1]) if len(S) else np.zeros_like(cos)
+        near = (np.hypot(half[..., 0], half[..., 1]) + reach + widest) ** 2
+        told = [pose[..., 0], pose[..., 1], cos, sin, half[..., 0], half[..., 1], along, mixed, across]
+        return np.ascontiguousarray(np.stack([*told, np.broadcast_to(z, cos.shape), near], 1))
+
+
+def no_obstacles(num_steps: int) -> Obstacles:
+    """None of them."""
+    return Obstacles(np.zeros((0, num_steps, 3)), np.zeros((0, 2)), np.zeros((0, num_steps, 2, 2)), np.zeros(0))
+
+
+def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
+    """Raises InputError for wrong shapes, NaN, sizes that are not positive, covariances with negative eigenvalues, and
+    probabilities outside [0, 1]."""
+    num = len(obstacles.pose)
+    wanted = {
+        "pose": (num, num_steps, 3),
+        "size": (num, 2),
+        "covariance": (num, num_steps, 2, 2),
+        "probability": (num,),
+    }
+    for name, shape in wanted.items():
+        found = np.asarray(getattr(obstacles, name))
+        if found.shape != shape:
+            raise InputError(f"obstacles: {name} has shape {found.shape}, but must be {shape}")
+        if not np.isfinite(found).all():
+            first = int(np.argwhere(~np.isfinite(found))[0, 0])
+            raise InputError(f"obstacle {first}: {name} is not finite")
+    for which in np.flatnonzero((obstacles.size <= 0).any(1)):
+        raise InputError(f"obstacle {which}: its size is {obstacles.size[which].tolist()}, but must be positive [m]")
+    if num and (np.linalg.eigvalsh(obstacles.covariance) < -1e-9).any():
+        raise InputError("obstacles: a covariance has a negative eigenvalue")
+    if ((obstacles.probability < 0) | (obstacles.probability > 1)).any():
+        raise InputError(f"obstacles: probabilities are {obstacles.probability.tolist()}, but lie between 0 and 1")
+
+
+class Boundary(NamedTuple):
+    """Segments of boundary lines in the cells of a grid that a circle of radius `reach` in the cell may touch.
+
+    segment  (N, 4) x, y of both ends
+    origin   x, y of the grid's corner [m]
+    shape    numbers of cells
+    offset   (cells + 1,), member: segments of cell c are member[offset[c]:offset[c + 1]]
+    cell     width of a cell [m]
+    reach    [m]
+    """
+
+    segment: Floats
+    origin: Floats
+    shape: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    member: NDArray[np.int64]
+    cell: float
+    reach: float
+
+
+def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, float, float] | None = None) -> Boundary:
+    """Of lines, each (N, 2) points [m]; `within` keeps what is nearer than r to (x, y): (x, y, r).
+
+    Raises InputError for NaN and wrong shapes."""
+    from planning.boundary_kernel import bucket
+
+    parts = [np.zeros((0, 4))]
+    for number, line in enumerate(lines):
+        points = np.asarray(line, float)
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+            raise InputError(f"boundary line {number}: it must be (N, 2) finite points, but has shape {points.shape}")
+        parts.append(np.hstack([points[:-1], points[1:]]))
+    segment = np.concatenate(parts)
+    if within is not None and len(segment):
+        x, y, r = within
+        length = np.hypot(*(segment[:, 2:] - segment[:, :2]).T)
+        segment = segment[np.hypot(segment[:, 0] - x, segment[:, 1] - y) <= r + length]
+    if not len(segment):
+        none = np.zeros(0, np.int64)
+        return Boundary(segment, np.zeros(2), np.zeros(2, np.int64), np.zeros(1, np.int64), none, CELL, reach)
+    ends = segment.reshape(-1, 2)
+    origin = ends.min(0) - reach - CELL
+    shape = np.ceil((ends.max(0) + reach + CELL - origin) / CELL).astype(np.int64)
+    offset, member = bucket(segment, origin, shape, CELL, reach)
+    return Boundary(np.ascontiguousarray(segment), origin, shape, offset, member, CELL, reach)

@@ -1,0 +1,115 @@
+"""What touches and what does not: never optimistic, against shapely and against simulation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely import affinity
+
+from models.program import InputError
+from planning.boundary_kernel import first_line
+from planning.shapes import CLEARANCE, Boundary, Obstacles, Vehicle, boundary
+
+VEHICLE = Vehicle()
+
+
+def rectangle(x: float, y: float, heading: float, length: float, width: float) -> shapely.Polygon:
+    box = shapely.box(-length / 2, -width / 2, length / 2, width / 2)
+    return affinity.translate(affinity.rotate(box, heading, (0, 0), use_radians=True), x, y)
+
+
+def test_circles_cover_the_vehicle() -> None:
+    for vehicle in (VEHICLE, Vehicle(12.0, 2.5, 3.0, 5), Vehicle(3.0, 1.5, 1.0, 1)):
+        circles = shapely.union_all([shapely.Point(c, 0).buffer(vehicle.radius, 128) for c in vehicle.circles])
+        body = rectangle(vehicle.middle, 0.0, 0.0, vehicle.length - 1e-2, vehicle.width - 1e-2)
+        assert circles.buffer(1e-3).contains(body)
+        assert vehicle.front == vehicle.middle + vehicle.length / 2
+
+
+def margins(r: np.ndarray, centres: np.ndarray, radius: float) -> np.ndarray:
+    return CLEARANCE(centres, np.array([[*r[:10], radius]]))[:, 0]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    x=st.floats(-6, 6), y=st.floats(-6, 6), heading=st.floats(-4, 4), length=st.floats(0.5, 8), width=st.floats(0.5, 3)
+)  # fmt: skip
+def test_the_distance_to_a_rectangle_is_shapelys_and_no_collision_is_missed(
+    x: float, y: float, heading: float, length: float, width: float
+) -> None:
+    body = Obstacles(np.array([[[x, y, heading]]]), np.array([[length, width]]), np.zeros((1, 1, 2, 2)), np.ones(1))
+    row = body.table(1e-3, VEHICLE.radius, 5.0)[0, :, 0]
+    shape = rectangle(x, y, heading, length, width)
+    centres = np.stack([VEHICLE.circles, np.zeros(3)], -1)
+    gaps = shapely.distance(shapely.points(centres), shape)
+    np.testing.assert_allclose(margins(row, centres, 0.0), gaps**2, atol=1e-9)
+    touched = (margins(row, centres, VEHICLE.radius) <= 0).any()
+    if shape.intersects(rectangle(VEHICLE.middle, 0.0, 0.0, VEHICLE.length, VEHICLE.width)):
+        assert touched
+    middle = np.hypot(x - VEHICLE.middle, y)
+    if middle**2 > row[10]:
+        assert not touched
+
+
+def test_a_chance_constraint_at_its_limit_is_kept_in_simulation() -> None:
+    """A circle just clear of an uncertain rectangle is touched no more often than allowed (Gaussian place)."""
+    rng = np.random.default_rng(0)
+    for covariance in ([[0.3, 0.1], [0.1, 0.2]], [[0.5, 0.0], [0.0, 0.01]]):
+        for bearing in (0.3, 1.2, 2.0, 3.0):
+            body = Obstacles(
+                np.array([[[0.0, 0.0, 0.4]]]), np.array([[4.0, 2.0]]), np.array([[covariance]]), np.ones(1)
+            )
+            row = body.table(0.05, 1.0, 5.0)[0, :, 0]
+            far = np.linspace(0.0, 8.0, 4001)[:, None] * [math.cos(bearing), math.sin(bearing)]
+            centre = far[np.flatnonzero(margins(row, far, 1.0) <= 0)[-1] + 1]
+            moved = centre - rng.multivariate_normal([0, 0], covariance, 40000)
+            rate = (margins(row * [1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 1], moved, 1.0) <= 0).mean()
+            assert rate < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 40000)
+            if bearing == 2.0:
+                assert rate > 0.02, "a straight side is met about as often as allowed"
+
+
+def test_unlikely_objects_get_a_larger_chance_each_and_the_unlikeliest_none() -> None:
+    same = Obstacles(
+        np.zeros((3, 1, 3)), np.ones((3, 2)), np.full((3, 1, 2, 2), np.eye(2)), np.array([1.0, 0.1, 0.009])
+    )
+    rows = same.table(0.01, 1.0, 1.0)
+    np.testing.assert_allclose(rows[:, 9, 0], [2.326347874, 1.281551566], atol=1e-8)
+
+
+def wire(seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [np.cumsum(rng.normal(0, 2.0, (20, 2)), 0) for _ in range(3)] + [np.array([(3.0, 3.0), (3.0, 3.0)])]
+
+
+def hit(lines: Boundary, x: float, y: float, radius: float) -> bool:
+    pose = np.array([[x, x], [y, y], [1.0, 1.0], [0.0, 0.0]])
+    return bool(first_line(pose, tuple(lines[:6]), np.zeros(1), radius) == 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_boundary_lines_are_touched_where_shapely_says(seed: int) -> None:
+    lines, shapes = boundary(wire(seed), 1.3), shapely.multilinestrings([shapely.linestrings(w) for w in wire(seed)])
+    points = np.random.default_rng(9).uniform(-15, 15, (2000, 2))
+    for radius in (1.3, 0.4):
+        expected = shapely.distance(shapely.points(points), shapes) <= radius
+        assert [hit(lines, x, y, radius) for x, y in points] == expected.tolist()
+        assert expected.any() and not expected.all()
+
+
+def test_no_lines_and_lines_far_away_touch_nothing() -> None:
+    assert not hit(boundary([], 1.0), 0.0, 0.0, 1.0)
+    line = np.array([(0.0, 0.0), (100.0, 0.0)])
+    near = boundary([np.array([(0.0, 150.0), (100.0, 150.0)]), line], 1.0, within=(0.0, 0.0, 20.0))
+    assert len(near.segment) == 1 and hit(near, 5.0, 0.5, 1.0) and not hit(near, 5.0, 150.0, 1.0)
+
+
+@pytest.mark.parametrize("line", [np.zeros((3, 3)), np.array([(0.0, math.nan), (1.0, 1.0)])])
+def test_lines_that_are_none_are_refused(line: np.ndarray) -> None:
+    with pytest.raises(InputError, match="boundary line 0"):
+        boundary([line], 1.0)

@@ -11,12 +11,13 @@ import math
 from numba import njit
 
 from planning.boundary_kernel import touches
-from planning.kinematics import GUARDED, MARGINS
+from planning.kinematics import GUARDED, MARGINS, PLACED
 from planning.reference_kernel import line_at
 from planning.shapes import CELL, CLEARANCE
 
 margins_of = MARGINS.scalar()
 clearance_of = CLEARANCE.scalar()
+placed = PLACED.scalar()
 
 NUM_MARGINS = len(GUARDED)
 GOOD = 0  # then 1 ... NUM_MARGINS for the margins
@@ -51,10 +52,18 @@ def along_line(coefficients, duration, table, step, dt, out):  # type: ignore[no
     """out (n, K, 9): s, s', s'', kappa, kappa', x, y, cos theta, sin theta of each motion at dt, 2 dt, ..."""
     for i in range(out.shape[0]):
         for k in range(out.shape[1]):
-            s, ds, dds = polynomial(coefficients, i, duration[i], (k + 1) * dt)
-            x, y, theta, kappa, slope = line_at(table, step, s)
+            out[i, k, 0], out[i, k, 1], out[i, k, 2] = polynomial(coefficients, i, duration[i], (k + 1) * dt)
+    add_line(table, step, out)
+
+
+@njit(cache=True, error_model="numpy")
+def add_line(table, step, out):  # type: ignore[no-untyped-def]
+    """Columns 3 to 8 of out (n, K, 9), the line at s, which is column 0."""
+    for i in range(out.shape[0]):
+        for k in range(out.shape[1]):
             row = out[i, k]
-            row[0], row[1], row[2], row[3], row[4] = s, ds, dds, kappa, slope
+            x, y, theta, kappa, slope = line_at(table, step, row[0])
+            row[3], row[4] = kappa, slope
             row[5], row[6], row[7], row[8] = x, y, math.cos(theta), math.sin(theta)
 
 
@@ -128,11 +137,7 @@ def judge(  # type: ignore[no-untyped-def]
             if s > end or s > stop:
                 found = STOP_POINT if s > stop else END_OF_LINE
                 break
-            w = 1.0 - a[3] * d
-            n = math.hypot(ds * w, dd)
-            t0, t1 = (ds * w / n, dd / n) if n > 1e-6 else (1.0, 0.0)
-            cos, sin = a[7] * t0 - a[8] * t1, a[8] * t0 + a[7] * t1
-            x, y = a[5] - d * a[8], a[6] + d * a[7]
+            x, y, cos, sin = placed(ds, a[3], d, dd, a[5], a[6], a[7], a[8])
             for q in range(len(circles)):
                 px, py = x + circles[q] * cos, y + circles[q] * sin
                 if touches(segment, origin, shape, offset, member, CELL, px, py, radius):

@@ -71,6 +71,40 @@ def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
 CLEARANCE = Formula("clearance", _clearance, 2, 11)
 
 
+ROUND = 6  # the exponent of the smooth outline: at 6 a car with circles of 1.35 m grows by 3 cm at its sides
+BEARINGS = 64  # at which it is fitted
+FITTED = 1.002  # what it is widened by, for the bearings between
+
+
+def _outline(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
+    px, py = x
+    ox, oy, cos, sin, half_length, half_width = p
+    u = ((px - ox) * cos + (py - oy) * sin) / half_length
+    v = ((py - oy) * cos - (px - ox) * sin) / half_width
+    return ((u**ROUND + v**ROUND + 1e-12) ** (1.0 / ROUND) - 1.0,)
+
+
+# where a circle's middle at x must not be: inside (|u|^6 + |v|^6)^(1/6) = 1, which holds all where CLEARANCE <= 0
+OUTLINE = Formula("outline", _outline, 2, 6)
+
+
+def outlines(table: Floats, radius: float) -> Floats:
+    """p (..., 6) of OUTLINE, for rows (..., 11) of Obstacles.table and circles of a radius [m].
+
+    A circle at q from the rectangle is just clear at |q| = radius + z sigma(q / |q|), so the outline must hold the
+    rectangle's corners moved by that in every direction. Its half axes are those of that shape, scaled together by
+    the largest value of the norm on it."""
+    bearing = 2 * np.pi * np.arange(BEARINGS) / BEARINGS
+    cos, sin = np.cos(bearing), np.sin(bearing)
+    along, mixed, across, z = (table[..., k, None] for k in (6, 7, 8, 9))
+    spread = along * cos**2 + 2 * mixed * cos * sin + across * sin**2
+    far = radius + z * np.sqrt(np.maximum(spread, 0.0))
+    x, y = table[..., 4, None] + far * np.abs(cos), table[..., 5, None] + far * np.abs(sin)
+    half = np.stack([x.max(-1), y.max(-1)], -1)
+    norm = ((x / half[..., :1]) ** ROUND + (y / half[..., 1:]) ** ROUND).max(-1) ** (1 / ROUND)
+    return np.concatenate([table[..., :4], half * FITTED * norm[..., None]], -1)
+
+
 class Obstacles(NamedTuple):
     """M rectangles at K times, the horizon's steps without the first, and how likely each is met.
 

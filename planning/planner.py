@@ -184,13 +184,13 @@ def plan(
     judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
     rejected = turned_down(judged)
     if judged.best >= 0:
-        return _chosen(scene, judged, judged.best, COMFORT, rejected)
+        return chosen(scene, judged, judged.best, COMFORT, rejected)
     relaxed = judge(planner, scene, made, planner.able)
     if relaxed.best >= 0:
-        return _chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
+        return chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
     stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able)
     best = stops.best if stops.best >= 0 else least_harm(planner, stops)
-    return _chosen(scene, stops, best, EMERGENCY, rejected)
+    return chosen(scene, stops, best, EMERGENCY, rejected)
 
 
 def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0) -> Candidates:
@@ -369,7 +369,8 @@ def least_harm(planner: Planner, judged: Candidates) -> int:
     return int(np.lexsort((judged.cost, speed[i, judged.when], judged.reason < BOUNDARY))[0])
 
 
-def _chosen(scene: Scene, judged: Candidates, best: int, tier: str, rejected: dict[str, int]) -> Plan:
+def chosen(scene: Scene, judged: Candidates, best: int, tier: str, rejected: dict[str, int]) -> Plan:
+    """The plan that is candidate `best`."""
     i, j = divmod(best, len(judged.lateral.cost))
     ahead = judged.longitudinal.motion.take([i])
     across = Lateral(

@@ -1,0 +1,303 @@
+"""A plan made better by optimal control: the same costs and limits, all motions instead of a fan of polynomials.
+
+    found = plan(planner, scene, previous, elapsed)
+    better = refine(planner, scene, found)           # better.states(t), better.trajectory(t): what to follow
+
+The problem is that of planning.optimal_problem, solved by fatrop (an interior-point method for problems in stages) and,
+where that fails, by IPOPT, from the candidate. What comes out is judged step by step by the code that judges
+candidates, on the exact line, with obstacles and boundary lines as they are. It is followed only if it is good within
+the limits of comfort and costs no more than the candidate; else the candidate stays.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning import optimal_problem as problem
+from planning.candidates import Keep, Reach
+from planning.corridor import corridor
+from planning.frenet import FrenetState, to_pose
+from planning.kinematics import LIMITS
+from planning.optimal_problem import ACROSS, CURVATURE, PLACE, TO_PLACE, TO_SPEED, Problem, Shape
+from planning.planner import (
+    COMFORT,
+    EMERGENCY,
+    RELAXED,
+    Plan,
+    Planner,
+    Scene,
+    candidates_of,
+    chosen,
+    forwards,
+    judge,
+    judge_states,
+    rectangles,
+    state_of,
+)
+from planning.polynomials import Polynomials, quartics, quintics, squared_jerk
+from planning.reference import ReferenceLine
+from planning.shapes import OUTLINE, outlines
+
+Floats = NDArray[np.float64]
+PER_STAGE = 2  # of the planner's steps
+DEAR = 10.0  # price of jerk after the time at which the candidate arrives
+OBSTACLES = (0, 1, 2, 3, 5, 8)  # problems are built for so many; only the nearest are told to it
+NEAR = 3.0  # of OUTLINE at the candidate: farther ones are left to the check
+FREE = (2.0, 8.0)  # how far the motion may be ahead of or behind the candidate, at once and more at the horizon [m]
+NODES = 14  # of the line in a stage's stretch
+SHORT = 1e-3  # of the last place allowed [m]
+FAR = 1e3  # [m], of what is not there
+
+
+class Motion(NamedTuple):
+    """Constant jerk over stages of `stage` seconds, then a polynomial.
+
+    states (N + 1, 3), jerk (N,)"""
+
+    stage: float
+    states: Floats
+    jerk: Floats
+    tail: Polynomials
+
+    def at(self, t: Floats) -> Floats:
+        """q, q', q'' (K, 3) at times t (K,)."""
+        n = len(self.jerk)
+        k = np.minimum((t / self.stage + 1e-9).astype(np.int64), n - 1)
+        told = np.stack(problem.advance(self.states[k].T, [self.jerk[k]], t - k * self.stage), -1)  # type: ignore[arg-type]
+        beyond = t > n * self.stage
+        told[beyond] = self.tail.at(t[beyond] - n * self.stage)[0]
+        return told
+
+
+class Refined(NamedTuple):
+    """What came of a refinement.
+
+    plan      that it began from
+    accepted  whether the refined motion is followed; if not, `why`: not converged, costs more, or what it breaks
+    along, across  the refined motion, where the solver made one
+    cost, candidate_cost  of both by the same functional; NaN without a motion
+    solver    that made it, or that failed last; `iterations` of all solvers
+    line_error  of the line as told to the solver [m]
+    """
+
+    plan: Plan
+    accepted: bool
+    why: str
+    along: Motion | None = None
+    across: Motion | None = None
+    cost: float = math.nan
+    candidate_cost: float = math.nan
+    solver: str = "none"
+    converged: bool = False
+    iterations: int = 0
+    line_error: float = math.nan
+
+    @property
+    def tier(self) -> str:
+        """Of what is followed."""
+        return COMFORT if self.accepted else self.plan.tier
+
+    @property
+    def clear(self) -> bool:
+        """Whether what is followed breaks nothing within the horizon."""
+        return self.accepted or self.plan.clear
+
+    def states(self, t: list[float] | Floats) -> list[FrenetState]:
+        """Where the vehicle is along the line at times t after the start."""
+        if not self.accepted or self.along is None or self.across is None:
+            return self.plan.states(t)
+        given = np.asarray(t, float)
+        along, across = forwards(self.along.at(given)), self.across.at(given)
+        return [state_of(a, d) for a, d in zip(along, across, strict=True)]
+
+    def trajectory(self, t: list[float] | Floats) -> Floats:
+        """x, y, heading, speed, acceleration, curvature (K, 6) at times t after the start."""
+        return np.array([to_pose(self.plan.line, state) for state in self.states(t)])
+
+
+def refine(planner: Planner, scene: Scene, found: Plan) -> Refined:
+    """The plan, or a better motion: it costs no more, or it is comfortable where no candidate was.
+
+    Nothing is raised for what a solver does: the candidate stays."""
+    try:
+        return _refined(planner, scene, found)
+    except (RuntimeError, ArithmeticError, np.linalg.LinAlgError) as failure:  # CasADi raises RuntimeError
+        return Refined(found, False, f"the solver failed: {failure}")
+
+
+def _refined(planner: Planner, scene: Scene, found: Plan) -> Refined:
+    begun = found if found.tier != EMERGENCY else _least_bad(planner, scene)
+    if begun.lateral.by_way[0]:
+        return Refined(found, False, "near standstill, offsets are told by the way")
+    shape, given, error = _posed(planner, scene, begun)
+    built = problem.problem(shape)
+    stages = shape.stage * np.arange(shape.num_stages + 1)
+    start = _from_start(begun, stages)
+    guess = np.concatenate([np.hstack([start[:-1], np.diff(start[:, [2, 5]], axis=0) / shape.stage]).ravel(), start[-1]])
+    parameters = np.concatenate([given[name].reshape(size).ravel("F") for name, size in built.parameters.items()])
+    iterations = 0
+    for solver in built.solvers:
+        solve = built.solvers[solver]
+        result = solve(x0=guess, p=parameters, lbg=built.lower, ubg=built.upper)
+        stats = solve.stats()
+        iterations += int(stats["iter_count"])
+        if stats["success"]:
+            break
+    else:
+        return Refined(found, False, "not converged", solver=solver, iterations=iterations, line_error=error)
+    controls = np.asarray(result["x"]).ravel()[:-6].reshape(-1, 8)[:, 6:]
+    along, across = _motions(shape, start[0], controls, given["ends"])
+    fixed = planner.weights.time * (
+        planner.weights.longitudinal * begun.longitudinal.duration[0]
+        + planner.weights.lateral * begun.lateral.motion.duration[0]
+    )
+    cost = float(result["f"]) + float(fixed)
+    told = planner.step * np.arange(1, planner.num_steps + 1)
+    ahead = along.at(told) + [scene.state.s, 0.0, 0.0]
+    why, _ = judge_states(planner, scene, ahead, across.at(told), planner.comfort)
+    if why == "none" and found.tier == COMFORT and not cost <= found.cost:
+        why = "costs more"
+    along = along._replace(states=along.states + [scene.state.s, 0.0, 0.0], tail=_moved(along.tail, scene.state.s))
+    return Refined(found, why == "none", why, along, across, cost, begun.cost, solver, True, iterations, error)
+
+
+def _least_bad(planner: Planner, scene: Scene) -> Plan:
+    """Of all candidates, the one that breaks what the vehicle can do latest, then the cheapest."""
+    judged = judge(planner, scene, candidates_of(planner, scene), planner.able, first_good=False)
+    best = int(np.lexsort((judged.cost, -judged.when))[0])
+    return chosen(scene, judged, best, RELAXED, {})
+
+
+def _from_start(begun: Plan, t: Floats) -> Floats:
+    """s, s', s'', d, d', d'' (K, 6) of a plan at times t, s from its start on."""
+    told = np.hstack([begun.along(t), begun.lateral.motion.at(t)[0]])
+    told[0, 1:3] = begun.start.ds, begun.start.dds
+    told[:, 0] -= begun.start.s
+    return told
+
+
+def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str, Floats], float]:
+    """The shape of a plan's problem, its parameters by name, and the error of the line as told to it [m]."""
+    num_stages = -(-planner.num_steps // PER_STAGE)
+    stage = PER_STAGE * planner.step
+    horizon = num_stages * stage
+    middles = stage * (np.arange(num_stages) + 0.5)
+    centre = _from_start(begun, middles)[:, 0]
+    pace = _from_start(begun, middles)[:, 1]
+    width = FREE[0] + FREE[1] * (middles / horizon) ** 2 + pace * stage
+    line, origin, error = _line(scene.line, scene.state.s, centre, width)
+    rows = _near(planner, scene, begun, planner.radius + error, num_stages * PER_STAGE)
+    rows[..., :2] -= origin
+    walled = bool(len(scene.boundary.segment))
+    shape = Shape(
+        num_stages,
+        PER_STAGE,
+        planner.step,
+        tuple(map(float, planner.vehicle.circles)),
+        planner.weights,
+        TO_SPEED if isinstance(scene.goal, Keep) else TO_PLACE,
+        rows.shape[1],
+        walled,
+    )
+    arrivals = np.array([begun.longitudinal.duration[0], begun.lateral.motion.duration[0]])
+    left = np.maximum(arrivals - horizon, planner.fans.soonest)
+    if isinstance(scene.goal, Reach):
+        place, speed = scene.goal.target(horizon + left[0])
+        wanted, moving = float(place) - scene.state.s, float(speed)
+    else:
+        wanted, moving = scene.goal.speed, 0.0
+    last = min(scene.stop - planner.vehicle.front, scene.line.length) - scene.state.s - SHORT
+    stand = min(scene.stand - planner.vehicle.front - scene.state.s - SHORT, FAR)
+    limits, state = planner.comfort, scene.state
+    given = {
+        "start": np.array([0.0, state.ds, state.dds, *state.lateral]),
+        "bent": np.array([to_pose(scene.line, state).curvature]),
+        "limits": np.array([getattr(limits, name) for name in LIMITS]),
+        "rate": np.array([limits.curvature_rate]),
+        "last": np.array([last, stand, limits.braking]),
+        "ends": np.array(
+            [
+                [wanted, moving, left[0], _price(arrivals[0], horizon, left[0])],
+                [scene.wanted, 0.0, left[1], _price(arrivals[1], horizon, left[1])],
+            ]
+        ).ravel(),
+        "price": _price(arrivals[:, None], stage * np.arange(num_stages), stage),
+        "line": line,
+        "walls": corridor(planner, scene, begun, middles) if walled else np.zeros((0, num_stages)),
+        "outlines": rows.reshape(len(rows), -1).T,
+    }
+    return shape, given, error
+
+
+def _price(arrival: Floats, begin: Floats | float, length: Floats | float) -> Floats:
+    """Mean over [begin, begin + length] of a price that is 1 before `arrival` and DEAR after it."""
+    cheap = np.clip((arrival - begin) / length, 0.0, 1.0)
+    priced: Floats = cheap + (1.0 - cheap) * DEAR
+    return priced
+
+
+def _line(line: ReferenceLine, start: float, centre: Floats, width: Floats) -> tuple[Floats, Floats, float]:
+    """Parameters (., N) of the line for each stage, the place from which its x and y are told, and the error [m].
+
+    Least squares at Chebyshev's nodes of [centre - width, centre + width]; straight on beyond the line's ends."""
+    nodes = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
+    wanted = start + centre[:, None] + width[:, None] * nodes  # (N, nodes)
+    s = np.clip(wanted, 0.0, line.length)
+    told = line.at(s)
+    place = told[..., :2] + (wanted - s)[..., None] * np.stack([np.cos(told[..., 2]), np.sin(told[..., 2])], -1)
+    origin = line.at(start)[:2]
+    powers = nodes[:, None] ** np.arange(PLACE)
+    fit = np.linalg.pinv(powers)
+    x, y = ((place[..., i] - origin[i]) @ fit.T for i in (0, 1))
+    error = max(float(np.abs(c @ powers.T + origin[i] - place[..., i]).max()) for i, c in enumerate((x, y)))
+    kappa = told[..., 3] @ np.linalg.pinv(powers[:, :CURVATURE]).T
+    return np.vstack([centre, width, kappa.T, x.T, y.T]), origin, error
+
+
+def _near(planner: Planner, scene: Scene, begun: Plan, radius: float, num_steps: int) -> Floats:
+    """p (K, M, 6) of OUTLINE for the obstacles nearest to a plan, and as many far away as the problem's size wants."""
+    rows = outlines(rectangles(planner, scene), radius)
+    t = planner.step * np.arange(1, planner.num_steps + 1)
+    x, y, heading = begun.trajectory(t)[:, :3].T
+    middle = np.stack([x + planner.vehicle.middle * np.cos(heading), y + planner.vehicle.middle * np.sin(heading)], -1)
+    apart = OUTLINE(np.repeat(middle, rows.shape[1], 0), rows.reshape(-1, 6))[:, 0].reshape(rows.shape[:2]).min(0)
+    nearest = np.argsort(apart, kind="stable")[: OBSTACLES[-1]]
+    nearest = nearest[apart[nearest] < NEAR]
+    size = next(size for size in OBSTACLES if size >= len(nearest))
+    told = np.broadcast_to([FAR, FAR, 1.0, 0.0, FAR / 10, FAR / 10], (num_steps, size, 6)).copy()
+    told[..., :2] += scene.line.at(scene.state.s)[:2]
+    told[: len(rows), : len(nearest)] = rows[:, nearest]
+    told[len(rows) :] = told[len(rows) - 1]
+    return told
+
+
+def _motions(shape: Shape, start: Floats, controls: Floats, ends: Floats) -> tuple[Motion, Motion]:
+    """Along and across, from the start by the controls, and on to the ends that cost least."""
+    states = [start]
+    for u in controls:
+        states.append(np.array(problem.advance(list(states[-1]), list(u), shape.stage)))
+    told, made = np.array(states), list[Motion]()
+    for i, kind in enumerate((shape.kind, ACROSS)):
+        part = told[:, 3 * i : 3 * i + 3]
+        wanted, pace, left, _ = own = ends[4 * i : 4 * i + 4]
+        end = float(problem.closing(kind, shape.weights)(part[-1], own)[1])
+        first = tuple(map(float, part[-1]))
+        if kind == TO_SPEED:
+            tail = quartics(first, [end], [left])
+        else:
+            tail = quintics(first, [[end, pace if kind == TO_PLACE else 0.0, 0.0]], [left])
+        made.append(Motion(shape.stage, part, controls[:, i], tail))
+    return made[0], made[1]
+
+
+def _moved(motion: Polynomials, by: float) -> Polynomials:
+    """The same from another origin."""
+    coefficients = motion.coefficients.copy()
+    coefficients[:, 0] += by
+    return motion._replace(coefficients=coefficients)

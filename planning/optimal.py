@@ -48,10 +48,11 @@ Floats = NDArray[np.float64]
 PER_STAGE = 2  # of the planner's steps
 DEAR = 10.0  # price of jerk after the time at which the candidate arrives
 OBSTACLES = (0, 1, 2, 3, 5, 8)  # problems are built for so many; only the nearest are told to it
-NEAR = 3.0  # of OUTLINE at the candidate: farther ones are left to the check
+NEAR = 1.1  # OUTLINE at the candidate: farther ones are left to the check
 FREE = (2.0, 8.0)  # how far the motion may be ahead of or behind the candidate, at once and more at the horizon [m]
 NODES = 14  # of the line in a stage's stretch
 SHORT = 1e-3  # of the last place allowed [m]
+DEARER = "costs more"
 FAR = 1e3  # [m], of what is not there
 
 
@@ -136,35 +137,71 @@ def _refined(planner: Planner, scene: Scene, found: Plan) -> Refined:
     if begun.lateral.by_way[0]:
         return Refined(found, False, "near standstill, offsets are told by the way")
     shape, given, error = _posed(planner, scene, begun)
-    built = problem.problem(shape)
     stages = shape.stage * np.arange(shape.num_stages + 1)
-    start = _from_start(begun, stages)
-    guess = np.concatenate([np.hstack([start[:-1], np.diff(start[:, [2, 5]], axis=0) / shape.stage]).ravel(), start[-1]])
+    states = _from_start(begun, stages)
+    guess = np.concatenate(
+        [np.hstack([states[:-1], np.diff(states[:, [2, 5]], axis=0) / shape.stage]).ravel(), states[-1]]
+    )
+    told, iterations = Refined(found, False, "not converged", line_error=error), 0
+    for fine in (False, True):
+        shape = shape._replace(fine=fine)
+        solved = _solved(shape, given, guess)
+        iterations += solved.iterations
+        if not solved.converged:
+            continue
+        told = _judged(planner, scene, found, begun, shape, given, solved, error)
+        if told.accepted or told.why == DEARER:
+            break
+    return told._replace(iterations=iterations)
+
+
+class _Solved(NamedTuple):
+    controls: Floats
+    cost: float
+    converged: bool
+    solver: str
+    iterations: int
+
+
+def _solved(shape: Shape, given: dict[str, Floats], guess: Floats) -> _Solved:
+    """By fatrop, else by IPOPT."""
+    built = problem.problem(shape)
     parameters = np.concatenate([given[name].reshape(size).ravel("F") for name, size in built.parameters.items()])
     iterations = 0
-    for solver in built.solvers:
-        solve = built.solvers[solver]
+    for name, solve in built.solvers.items():
         result = solve(x0=guess, p=parameters, lbg=built.lower, ubg=built.upper)
         stats = solve.stats()
         iterations += int(stats["iter_count"])
         if stats["success"]:
             break
-    else:
-        return Refined(found, False, "not converged", solver=solver, iterations=iterations, line_error=error)
     controls = np.asarray(result["x"]).ravel()[:-6].reshape(-1, 8)[:, 6:]
-    along, across = _motions(shape, start[0], controls, given["ends"])
-    fixed = planner.weights.time * (
-        planner.weights.longitudinal * begun.longitudinal.duration[0]
-        + planner.weights.lateral * begun.lateral.motion.duration[0]
+    return _Solved(controls, float(result["f"]), bool(stats["success"]), name, iterations)
+
+
+def _judged(
+    planner: Planner,
+    scene: Scene,
+    found: Plan,
+    begun: Plan,
+    shape: Shape,
+    given: dict[str, Floats],
+    solved: _Solved,
+    error: float,
+) -> Refined:
+    """Whether a solution is followed."""
+    along, across = _motions(shape, given["start"], solved.controls, given["ends"])
+    weights = planner.weights
+    cost = solved.cost + weights.time * (
+        weights.longitudinal * float(begun.longitudinal.duration[0])
+        + weights.lateral * float(begun.lateral.motion.duration[0])
     )
-    cost = float(result["f"]) + float(fixed)
-    told = planner.step * np.arange(1, planner.num_steps + 1)
-    ahead = along.at(told) + [scene.state.s, 0.0, 0.0]
-    why, _ = judge_states(planner, scene, ahead, across.at(told), planner.comfort)
+    s = scene.state.s
+    along = along._replace(states=along.states + [s, 0.0, 0.0], tail=_moved(along.tail, s))
+    t = planner.step * np.arange(1, planner.num_steps + 1)
+    why, _ = judge_states(planner, scene, along.at(t), across.at(t), planner.comfort)
     if why == "none" and found.tier == COMFORT and not cost <= found.cost:
-        why = "costs more"
-    along = along._replace(states=along.states + [scene.state.s, 0.0, 0.0], tail=_moved(along.tail, scene.state.s))
-    return Refined(found, why == "none", why, along, across, cost, begun.cost, solver, True, iterations, error)
+        why = DEARER
+    return Refined(found, why == "none", why, along, across, cost, begun.cost, solved.solver, True, 0, error)
 
 
 def _least_bad(planner: Planner, scene: Scene) -> Plan:
@@ -188,8 +225,7 @@ def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str
     stage = PER_STAGE * planner.step
     horizon = num_stages * stage
     middles = stage * (np.arange(num_stages) + 0.5)
-    centre = _from_start(begun, middles)[:, 0]
-    pace = _from_start(begun, middles)[:, 1]
+    centre, pace = _from_start(begun, middles + stage / 2)[:, :2].T
     width = FREE[0] + FREE[1] * (middles / horizon) ** 2 + pace * stage
     line, origin, error = _line(scene.line, scene.state.s, centre, width)
     rows = _near(planner, scene, begun, planner.radius + error, num_stages * PER_STAGE)
@@ -204,6 +240,7 @@ def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str
         TO_SPEED if isinstance(scene.goal, Keep) else TO_PLACE,
         rows.shape[1],
         walled,
+        False,
     )
     arrivals = np.array([begun.longitudinal.duration[0], begun.lateral.motion.duration[0]])
     left = np.maximum(arrivals - horizon, planner.fans.soonest)

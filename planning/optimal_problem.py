@@ -21,13 +21,15 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from planning.candidates import Weights
-from planning.kinematics import LIMITS, MARGINS, PLACED
+from planning.kinematics import GUARDED, LIMITS, MARGINS, PLACED
 from planning.polynomials import QUARTIC, QUINTIC, SQUARED_JERK
 from planning.shapes import OUTLINE
 
 CURVATURE, PLACE = 6, 7  # coefficients of the line's curvature, and of its x and y, in z
 KEPT, SETTLED = 0.005, 0.5  # a share of each limit is kept free, from that time on [s]: the line is told with errors
-MOST = 60  # iterations
+STEADY = 0.02  # of the curvature's rate, kept free: it varies within a stage
+TOLERANCE = 1e-4  # of optimality
+MOST = 100  # iterations
 ACROSS, TO_SPEED, TO_PLACE = "across", "to a speed", "to a place"
 
 
@@ -38,6 +40,7 @@ class Shape(NamedTuple):
     circles                      of the vehicle, ahead of the rear axle [m]; radius [m]
     kind                         TO_SPEED or TO_PLACE, of the goal
     num_obstacles, walled        whether there are boundary lines
+    fine                         constraints within the stages too, and the curvature's rate
     """
 
     num_stages: int
@@ -48,6 +51,7 @@ class Shape(NamedTuple):
     kind: str
     num_obstacles: int
     walled: bool
+    fine: bool
 
     @property
     def stage(self) -> float:
@@ -114,7 +118,7 @@ def problem(shape: Shape) -> Problem:
         "ends": (8, 1),  # of `closing`, along then across
         "price": (2, shape.num_stages),
         "line": (2 + CURVATURE + 2 * PLACE, shape.num_stages),  # centre, width, coefficients of rising powers
-        "walls": (2 * len(shape.circles) * shape.walled, shape.num_stages),  # least and largest offset of each circle
+        "walls": (2 * len(shape.circles) * shape.walled, shape.num_stages),  # least, largest offset of each circle
         "outlines": (OUTLINE.num_p * shape.num_obstacles, shape.num_stages * shape.per_stage),
     }
     p = {name: ca.SX.sym(name, *size) for name, size in parameters.items()}
@@ -128,13 +132,17 @@ def problem(shape: Shape) -> Problem:
         equal.extend([equality] * value.shape[0])
 
     for k, u in enumerate(controls):
-        x = ca.vertsplit(states[k])
-        add(states[k + 1] - ca.vertcat(*advance(x, ca.vertsplit(u), shape.stage)), True)
+        x, u = ca.vertsplit(states[k]), ca.vertsplit(u)
+        add(states[k + 1] - ca.vertcat(*advance(x, u, shape.stage)), True)
         if k == 0:
             add(states[0] - p["start"], True)
-        add(ca.vertcat(*_kept(shape, p, k, x, ca.vertsplit(u))), False)
+        else:
+            add(ca.vertcat(*_kept(shape, p, k, x)), False)
+        if shape.fine:
+            add(ca.vertcat(*_kept_within(shape, p, k, x, u)), False)
         cost += weights.longitudinal * weights.jerk * p["price"][0, k] * shape.stage * u[0] ** 2
         cost += weights.lateral * weights.jerk * p["price"][1, k] * shape.stage * u[1] ** 2
+    add(ca.vertcat(*_kept(shape, p, shape.num_stages, ca.vertsplit(states[-1]))), False)
     final = states[-1]
     add(p["last"][1] - final[0] - final[1] ** 2 / (2 * p["last"][2]), False)
     cost += weights.longitudinal * closing(shape.kind, weights)(final[:3], p["ends"][:4])[0]
@@ -151,13 +159,13 @@ def problem(shape: Shape) -> Problem:
             programme,
             quiet
             | {"structure_detection": "auto", "equality": equal}
-            | {"fatrop": {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST}},
+            | {"fatrop": {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST, "tol": TOLERANCE}},
         ),
         "ipopt": ca.nlpsol(
             "ipopt",
             "ipopt",
             programme,
-            quiet | {"ipopt": {"print_level": 0, "sb": "yes", "mu_init": 1e-2, "max_iter": MOST, "tol": 1e-6}},
+            quiet | {"ipopt": {"print_level": 0, "sb": "yes", "mu_init": 1e-2, "max_iter": MOST, "tol": TOLERANCE}},
         ),
     }
     upper = [0.0 if same else ca.inf for same in equal]
@@ -171,25 +179,26 @@ def problem(shape: Shape) -> Problem:
     )
 
 
-def _kept(shape: Shape, p: dict[str, Any], k: int, x: list[Any], u: list[Any]) -> list[Any]:
-    """What must not be negative within stage k."""
-    import casadi as ca
+def _kept(shape: Shape, p: dict[str, Any], k: int, x: list[Any]) -> list[Any]:
+    """What must not be negative at the end of stage k - 1, which is the start of stage k."""
+    line = _line(p["line"][:, k - 1], x[0])
+    share = 1.0 - KEPT * min(k * shape.stage / SETTLED, 1.0)
+    margins = _margins(p, x, line, share)[: len(GUARDED)]
+    clear = _clear(shape, p, k - 1, shape.per_stage * k - 1, x, line)
+    return [*margins, 1 - line.z, 1 + line.z, p["last"][0] - x[0], *clear]
 
-    line = _line(p["line"][:, k], x[0])
-    bent = _margins(p, x, line, 1.0)[-1] if k else p["bent"]
+
+def _kept_within(shape: Shape, p: dict[str, Any], k: int, x: list[Any], u: list[Any]) -> list[Any]:
+    """What must not be negative between: the obstacles' outlines, and how far the curvature changes within stage k."""
     told = list[Any]()
-    for i in range(shape.per_stage):
-        at = shape.per_stage * k + i
-        share = 1.0 - KEPT * min((at + 1) * shape.step / SETTLED, 1.0)
+    for i in range(shape.per_stage - 1):
         y = advance(x, u, (i + 1) * shape.step)
-        line = _line(p["line"][:, k], y[0])
-        *margins, _, curvature = _margins(p, y, line, share)
-        turned, allowed = (curvature - bent) / shape.step, share * p["rate"]
-        told += [*margins, allowed - turned, allowed + turned, 1 - line.z, 1 + line.z, p["last"][0] - y[0]]
-        bent = curvature
-        if shape.walled or shape.num_obstacles:
-            told += _clear(shape, p, k, at, y, line)
-    return [ca.vertcat(*told)]
+        told += _clear(shape, p, k, shape.per_stage * k + i, y, _line(p["line"][:, k], y[0]))
+    y = advance(x, u, shape.stage)
+    before = _margins(p, x, _line(p["line"][:, k], x[0]), 1.0)[-1] if k else p["bent"]
+    turned = (_margins(p, y, _line(p["line"][:, k], y[0]), 1.0)[-1] - before) / shape.stage
+    allowed = (1.0 - STEADY) * p["rate"]
+    return [*told, allowed - turned, allowed + turned]
 
 
 class _Line(NamedTuple):
@@ -234,6 +243,8 @@ def _clear(shape: Shape, p: dict[str, Any], k: int, at: int, y: list[Any], line:
     """OUTLINE of each obstacle and circle; how far each circle is from the lines left and right."""
     import casadi as ca
 
+    if not (shape.walled or shape.num_obstacles):
+        return []
     placed = PLACED.casadi()(ca.vertcat(y[1], line.kappa, y[3], y[4], *line[3:]), [])
     px, py, cos, sin = ca.vertsplit(placed)
     told = list[Any]()

@@ -81,10 +81,11 @@ def _outline(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
     ox, oy, cos, sin, half_length, half_width = p
     u = ((px - ox) * cos + (py - oy) * sin) / half_length
     v = ((py - oy) * cos - (px - ox) * sin) / half_width
-    return ((u**ROUND + v**ROUND + 1e-12) ** (1.0 / ROUND) - 1.0,)
+    uu, vv = u * u, v * v
+    return (ops.log(uu * uu * uu + vv * vv * vv + 1e-12) / ROUND,)
 
 
-# where a circle's middle at x must not be: inside (|u|^6 + |v|^6)^(1/6) = 1, which holds all where CLEARANCE <= 0
+# log of the norm (|u|^6 + |v|^6)^(1/6), negative inside an outline that holds all x where CLEARANCE <= 0
 OUTLINE = Formula("outline", _outline, 2, 6)
 
 

@@ -9,14 +9,16 @@ from planning.planner import Plan, Planner, Scene
 from planning.reference_kernel import FOUND
 
 Floats = NDArray[np.float64]
-APART = 0.5  # of the points of a segment that are looked at [m]
+APART = 1.0  # of the points of a segment that are looked at [m]
 SPARE = 0.02  # kept free beside the exact check [m]
 SLIPPING = 1.0  # how far a motion may be ahead or behind, and still finds its lines looked at, at least [m]
 OPEN = 50.0  # where there is no line [m]
+BESIDE = 1.0  # of free space beside a plan: with more on both sides its problem has no lines [m]
 
 
-def corridor(planner: Planner, scene: Scene, begun: Plan, t: Floats) -> Floats:
-    """Least and largest offset of each circle's middle at times t: (2 n, K), rows lower and upper, circle by circle.
+def corridor(planner: Planner, scene: Scene, begun: Plan, t: Floats) -> Floats | None:
+    """Least and largest offset of each circle's middle at times t: (2 n, K), rows lower and upper, circle by circle;
+    None where lines are farther from the plan than BESIDE.
 
     A point of a line is left where its offset is larger than the plan's at that arc length, and lies in a circle's way
     where their arc lengths are nearer than the circle's radius and some slip, which grows with time."""
@@ -29,14 +31,15 @@ def corridor(planner: Planner, scene: Scene, begun: Plan, t: Floats) -> Floats:
     out = np.empty((2 * len(circles), len(t)))
     out[0::2], out[1::2] = -OPEN, OPEN
     if not len(s):
-        return out
+        return None
     own = np.interp(s, *_path(begun, t[-1] + 1.0))
     left, right = d > own, d <= own
     for n, ahead in enumerate(circles):
         near = np.abs(s - (at + ahead)[:, None]) < radius + slip[:, None]  # (K, points)
         out[2 * n] = np.where(near & right, d, -OPEN).max(1) + radius
         out[2 * n + 1] = np.where(near & left, d, OPEN).min(1) - radius
-    return out
+    beside = begun.lateral.motion.at(t)[0, :, 0]
+    return out if (out[0::2] > beside - BESIDE).any() or (out[1::2] < beside + BESIDE).any() else None
 
 
 def _path(begun: Plan, until: float) -> tuple[Floats, Floats]:
@@ -56,7 +59,8 @@ def _points(scene: Scene, first: float, last: float) -> tuple[Floats, Floats]:
         return np.zeros(0), np.zeros(0)
     count = np.maximum(np.ceil(np.hypot(*(segment[:, 2:] - segment[:, :2]).T) / APART), 1).astype(np.int64)
     which = np.repeat(np.arange(len(segment)), count + 1)
-    share = np.concatenate([np.linspace(0.0, 1.0, n + 1) for n in count])[:, None]
+    number = np.arange(len(which)) - np.repeat(np.cumsum(count + 1) - (count + 1), count + 1)  # in its segment
+    share = (number / count[which])[:, None]
     points = segment[which, :2] * (1 - share) + segment[which, 2:] * share
     told, ended = scene.line.project(points)
     kept = (ended == FOUND) & (told[:, 0] >= first) & (told[:, 0] <= last)

@@ -12,8 +12,6 @@ the limits of comfort and costs no more than the candidate; else the candidate s
 from __future__ import annotations
 
 import math
-import time
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +21,8 @@ from planning import optimal_problem as problem
 from planning.candidates import Keep, Reach
 from planning.corridor import corridor
 from planning.frenet import FrenetState, to_pose
-from planning.kinematics import LIMITS
-from planning.optimal_problem import ACROSS, CURVATURE, PLACE, TO_PLACE, TO_SPEED, Problem, Shape
+from planning.kinematics import LIMITS, PLACED
+from planning.optimal_problem import ACROSS, CURVATURE, PLACE, TO_PLACE, TO_SPEED, Shape
 from planning.planner import (
     COMFORT,
     EMERGENCY,
@@ -40,7 +38,7 @@ from planning.planner import (
     rectangles,
     state_of,
 )
-from planning.polynomials import Polynomials, quartics, quintics, squared_jerk
+from planning.polynomials import NOTHING, Polynomials, quartics, quintics
 from planning.reference import ReferenceLine
 from planning.shapes import OUTLINE, outlines
 
@@ -137,7 +135,7 @@ def _refined(planner: Planner, scene: Scene, found: Plan) -> Refined:
     if begun.lateral.by_way[0]:
         return Refined(found, False, "near standstill, offsets are told by the way")
     shape, given, error = _posed(planner, scene, begun)
-    stages = shape.stage * np.arange(shape.num_stages + 1)
+    stages = shape.stage * np.arange(shape.num_stages + 1.0)
     states = _from_start(begun, stages)
     guess = np.concatenate(
         [np.hstack([states[:-1], np.diff(states[:, [2, 5]], axis=0) / shape.stage]).ravel(), states[-1]]
@@ -168,14 +166,14 @@ def _solved(shape: Shape, given: dict[str, Floats], guess: Floats) -> _Solved:
     built = problem.problem(shape)
     parameters = np.concatenate([given[name].reshape(size).ravel("F") for name, size in built.parameters.items()])
     iterations = 0
-    for name, solve in built.solvers.items():
-        result = solve(x0=guess, p=parameters, lbg=built.lower, ubg=built.upper)
-        stats = solve.stats()
+    for solver in built.solvers:
+        result = built.solvers[solver](x0=guess, p=parameters, lbg=built.lower, ubg=built.upper)
+        stats = built.solvers[solver].stats()
         iterations += int(stats["iter_count"])
         if stats["success"]:
             break
     controls = np.asarray(result["x"]).ravel()[:-6].reshape(-1, 8)[:, 6:]
-    return _Solved(controls, float(result["f"]), bool(stats["success"]), name, iterations)
+    return _Solved(controls, float(result["f"]), bool(stats["success"]), solver, iterations)
 
 
 def _judged(
@@ -195,9 +193,8 @@ def _judged(
         weights.longitudinal * float(begun.longitudinal.duration[0])
         + weights.lateral * float(begun.lateral.motion.duration[0])
     )
-    s = scene.state.s
-    along = along._replace(states=along.states + [s, 0.0, 0.0], tail=_moved(along.tail, s))
-    t = planner.step * np.arange(1, planner.num_steps + 1)
+    along = _moved(along, scene.state.s)
+    t = planner.step * np.arange(1.0, planner.num_steps + 1.0)
     why, _ = judge_states(planner, scene, along.at(t), across.at(t), planner.comfort)
     if why == "none" and found.tier == COMFORT and not cost <= found.cost:
         why = DEARER
@@ -224,13 +221,13 @@ def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str
     num_stages = -(-planner.num_steps // PER_STAGE)
     stage = PER_STAGE * planner.step
     horizon = num_stages * stage
-    middles = stage * (np.arange(num_stages) + 0.5)
-    centre, pace = _from_start(begun, middles + stage / 2)[:, :2].T
-    width = FREE[0] + FREE[1] * (middles / horizon) ** 2 + pace * stage
+    ends = stage * (np.arange(1.0, num_stages + 1.0))
+    centre, pace = _from_start(begun, ends)[:, :2].T
+    width = FREE[0] + FREE[1] * (ends / horizon) ** 2 + pace * stage
     line, origin, error = _line(scene.line, scene.state.s, centre, width)
     rows = _near(planner, scene, begun, planner.radius + error, num_stages * PER_STAGE)
     rows[..., :2] -= origin
-    walled = bool(len(scene.boundary.segment))
+    walls = corridor(planner, scene, begun, ends) if len(scene.boundary.segment) else None
     shape = Shape(
         num_stages,
         PER_STAGE,
@@ -239,7 +236,7 @@ def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str
         planner.weights,
         TO_SPEED if isinstance(scene.goal, Keep) else TO_PLACE,
         rows.shape[1],
-        walled,
+        walls is not None,
         False,
     )
     arrivals = np.array([begun.longitudinal.duration[0], begun.lateral.motion.duration[0]])
@@ -264,9 +261,9 @@ def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str
                 [scene.wanted, 0.0, left[1], _price(arrivals[1], horizon, left[1])],
             ]
         ).ravel(),
-        "price": _price(arrivals[:, None], stage * np.arange(num_stages), stage),
+        "price": _price(arrivals[:, None], ends - stage, stage),
         "line": line,
-        "walls": corridor(planner, scene, begun, middles) if walled else np.zeros((0, num_stages)),
+        "walls": np.zeros((0, num_stages)) if walls is None else walls,
         "outlines": rows.reshape(len(rows), -1).T,
     }
     return shape, given, error
@@ -300,18 +297,20 @@ def _line(line: ReferenceLine, start: float, centre: Floats, width: Floats) -> t
 def _near(planner: Planner, scene: Scene, begun: Plan, radius: float, num_steps: int) -> Floats:
     """p (K, M, 6) of OUTLINE for the obstacles nearest to a plan, and as many far away as the problem's size wants."""
     rows = outlines(rectangles(planner, scene), radius)
-    t = planner.step * np.arange(1, planner.num_steps + 1)
-    x, y, heading = begun.trajectory(t)[:, :3].T
-    middle = np.stack([x + planner.vehicle.middle * np.cos(heading), y + planner.vehicle.middle * np.sin(heading)], -1)
+    told = _from_start(begun, planner.step * np.arange(1.0, planner.num_steps + 1.0))
+    line = scene.line.at(scene.state.s + told[:, 0])
+    turned = np.stack([np.cos(line[:, 2]), np.sin(line[:, 2])], -1)
+    placed = PLACED(np.column_stack([told[:, 1], line[:, 3], told[:, 3:5], line[:, :2], turned]), NOTHING)
+    middle = placed[:, :2] + planner.vehicle.middle * placed[:, 2:]
     apart = OUTLINE(np.repeat(middle, rows.shape[1], 0), rows.reshape(-1, 6))[:, 0].reshape(rows.shape[:2]).min(0)
     nearest = np.argsort(apart, kind="stable")[: OBSTACLES[-1]]
     nearest = nearest[apart[nearest] < NEAR]
     size = next(size for size in OBSTACLES if size >= len(nearest))
-    told = np.broadcast_to([FAR, FAR, 1.0, 0.0, FAR / 10, FAR / 10], (num_steps, size, 6)).copy()
-    told[..., :2] += scene.line.at(scene.state.s)[:2]
-    told[: len(rows), : len(nearest)] = rows[:, nearest]
-    told[len(rows) :] = told[len(rows) - 1]
-    return told
+    kept = np.broadcast_to([FAR, FAR, 1.0, 0.0, FAR / 10, FAR / 10], (num_steps, size, 6)).copy()
+    kept[..., :2] += scene.line.at(scene.state.s)[:2]
+    kept[: len(rows), : len(nearest)] = rows[:, nearest]
+    kept[len(rows) :] = kept[len(rows) - 1]
+    return kept
 
 
 def _motions(shape: Shape, start: Floats, controls: Floats, ends: Floats) -> tuple[Motion, Motion]:
@@ -322,7 +321,7 @@ def _motions(shape: Shape, start: Floats, controls: Floats, ends: Floats) -> tup
     told, made = np.array(states), list[Motion]()
     for i, kind in enumerate((shape.kind, ACROSS)):
         part = told[:, 3 * i : 3 * i + 3]
-        wanted, pace, left, _ = own = ends[4 * i : 4 * i + 4]
+        _, pace, left, _ = own = ends[4 * i : 4 * i + 4]
         end = float(problem.closing(kind, shape.weights)(part[-1], own)[1])
         first = tuple(map(float, part[-1]))
         if kind == TO_SPEED:
@@ -333,8 +332,9 @@ def _motions(shape: Shape, start: Floats, controls: Floats, ends: Floats) -> tup
     return made[0], made[1]
 
 
-def _moved(motion: Polynomials, by: float) -> Polynomials:
+def _moved(motion: Motion, by: float) -> Motion:
     """The same from another origin."""
-    coefficients = motion.coefficients.copy()
+    states, coefficients = motion.states.copy(), motion.tail.coefficients.copy()
+    states[:, 0] += by
     coefficients[:, 0] += by
-    return motion._replace(coefficients=coefficients)
+    return motion._replace(states=states, tail=motion.tail._replace(coefficients=coefficients))

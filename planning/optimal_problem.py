@@ -124,15 +124,15 @@ def problem(shape: Shape) -> Problem:
     p = {name: ca.SX.sym(name, *size) for name, size in parameters.items()}
     states = [ca.SX.sym(f"x{k}", 6) for k in range(shape.num_stages + 1)]
     controls = [ca.SX.sym(f"u{k}", 2) for k in range(shape.num_stages)]
-    weights, cost = shape.weights, 0
+    weights, cost = shape.weights, ca.SX(0)
     constraints, equal = list[Any](), list[bool]()
 
     def add(value: Any, equality: bool) -> None:
         constraints.append(value)
         equal.extend([equality] * value.shape[0])
 
-    for k, u in enumerate(controls):
-        x, u = ca.vertsplit(states[k]), ca.vertsplit(u)
+    for k, control in enumerate(controls):
+        x, u = ca.vertsplit(states[k]), ca.vertsplit(control)
         add(states[k + 1] - ca.vertcat(*advance(x, u, shape.stage)), True)
         if k == 0:
             add(states[0] - p["start"], True)
@@ -151,7 +151,7 @@ def problem(shape: Shape) -> Problem:
     w = ca.vertcat(*(part for pair in zip(states, controls, strict=False) for part in pair), final)
     g, vector = ca.vertcat(*constraints), ca.vertcat(*(ca.vec(p[name]) for name in parameters))
     programme = {"x": w, "p": vector, "f": cost, "g": g}
-    quiet = {"print_time": False, "error_on_fail": False}
+    quiet: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     solvers = {
         "fatrop": ca.nlpsol(
             "fatrop",
@@ -217,9 +217,7 @@ def _line(told: Any, s: Any) -> _Line:
 
     centre, width, *c = ca.vertsplit(told)
     z = (s - centre) / width
-    (kappa, slope), (x, cos), (y, sin) = (
-        _horner(part, z) for part in (c[:CURVATURE], c[CURVATURE:-PLACE], c[-PLACE:])
-    )
+    (kappa, slope), (x, cos), (y, sin) = (_horner(part, z) for part in (c[:CURVATURE], c[CURVATURE:-PLACE], c[-PLACE:]))
     return _Line(z, kappa, slope / width, x, y, cos / width, sin / width)
 
 

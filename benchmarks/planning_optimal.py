@@ -45,7 +45,7 @@ def scene(planner: Planner, seed: int) -> Scene:
     num = int(rng.integers(LARGEST + 1))
     pace = rng.uniform(0.0, speed, num)
     ahead = rng.uniform(12.0, 25.0, num) + 2.0 * (speed - pace) + 12.0 * np.arange(num)
-    side = rng.choice([-1.0, 1.0], num) * rng.uniform(1.6, 3.2, num)
+    side = rng.choice([-1.0, 1.0], num) * rng.uniform(1.2, 3.2, num)
     others = _others(line, 20.0 + ahead, side, pace, rng.uniform(0.0, 0.2, num), planner)
     goal: Goal = Keep(max(speed + rng.uniform(-4.0, 3.0), 0.0))
     end = np.inf
@@ -54,7 +54,8 @@ def scene(planner: Planner, seed: int) -> Scene:
     elif rng.random() < 0.2:
         end = 20.0 + planner.vehicle.front + speed**2 / 4.0 + 10.0
         goal = stop(end, planner.vehicle.front)
-    lines = [line.place(np.arange(0.0, 200.0, 1.0), d) for d in (-5.0, 5.0)]
+    sides = rng.uniform(2.4, 5.0, 2)
+    lines = [line.place(np.arange(0.0, 200.0, 1.0), d) for d in (-sides[0], sides[1])]
     return Scene(
         line, state, goal, np.linspace(-2.4, 2.4, 13), 0.0, boundary(lines, planner.radius), others, stop=float(end)
     )

@@ -48,6 +48,7 @@ DEAR = 10.0  # price of jerk after the time at which the candidate arrives
 OBSTACLES = (0, 1, 2, 3, 5, 8)  # problems are built for so many; only the nearest are told to it
 NEAR = 1.1  # OUTLINE at the candidate: farther ones are left to the check
 FREE = (2.0, 8.0)  # how far the motion may be ahead of or behind the candidate, at once and more at the horizon [m]
+SOONEST = 0.45  # [s] after the horizon that the candidate's end is kept; nearer ones are put off: all but a constraint
 NODES = 14  # of the line in a stage's stretch
 SHORT = 1e-3  # of the last place allowed [m]
 DEARER = "costs more"
@@ -120,33 +121,36 @@ class Refined(NamedTuple):
         return np.array([to_pose(self.plan.line, state) for state in self.states(t)])
 
 
-def refine(planner: Planner, scene: Scene, found: Plan) -> Refined:
-    """The plan, or a better motion: it costs no more, or it is comfortable where no candidate was.
+def refine(planner: Planner, scene: Scene, found: Plan, *, per_stage: int = PER_STAGE) -> Refined:
+    """The plan of this scene, or a better motion: it costs no more, or it is comfortable where no candidate was.
 
-    Nothing is raised for what a solver does: the candidate stays."""
+    per_stage  of the planner's steps, in which jerk is constant
+
+    Nothing is raised for what a solver does: the candidate stays. The next plan is made with `found` as the previous
+    one, of which there is no rest where the vehicle follows a refined motion: the horizon recedes, so that consecutive
+    refined motions differ where something is still to be mended at its end."""
     try:
-        return _refined(planner, scene, found)
+        return _refined(planner, scene, found, per_stage)
     except (RuntimeError, ArithmeticError, np.linalg.LinAlgError) as failure:  # CasADi raises RuntimeError
         return Refined(found, False, f"the solver failed: {failure}")
 
 
-def _refined(planner: Planner, scene: Scene, found: Plan) -> Refined:
+def _refined(planner: Planner, scene: Scene, found: Plan, per_stage: int) -> Refined:
     begun = found if found.tier != EMERGENCY else _least_bad(planner, scene)
     if begun.lateral.by_way[0]:
         return Refined(found, False, "near standstill, offsets are told by the way")
-    shape, given, error = _posed(planner, scene, begun)
+    if begun.along(planner.step * np.arange(planner.num_steps + 1.0))[:, 1].min() < problem.SLOWEST:
+        return Refined(found, False, "comes near standstill, where directions are undefined")
+    shape, given, error = _posed(planner, scene, begun, per_stage)
     stages = shape.stage * np.arange(shape.num_stages + 1.0)
-    states = _from_start(begun, stages)
-    guess = np.concatenate(
-        [np.hstack([states[:-1], np.diff(states[:, [2, 5]], axis=0) / shape.stage]).ravel(), states[-1]]
-    )
+    guess = _packed(_from_start(begun, stages), shape.stage)
     told, iterations = Refined(found, False, "not converged", line_error=error), 0
     for fine in (False, True):
         shape = shape._replace(fine=fine)
         solved = _solved(shape, given, guess)
         iterations += solved.iterations
         if not solved.converged:
-            continue
+            break
         told = _judged(planner, scene, found, begun, shape, given, solved, error)
         if told.accepted or told.why == DEARER:
             break
@@ -166,14 +170,15 @@ def _solved(shape: Shape, given: dict[str, Floats], guess: Floats) -> _Solved:
     built = problem.problem(shape)
     parameters = np.concatenate([given[name].reshape(size).ravel("F") for name, size in built.parameters.items()])
     iterations = 0
-    for solver in built.solvers:
-        result = built.solvers[solver](x0=guess, p=parameters, lbg=built.lower, ubg=built.upper)
-        stats = built.solvers[solver].stats()
+    for name in problem.SOLVERS:
+        solve = problem.solver(shape, name)
+        result = solve(x0=guess, p=parameters, lbg=built.lower, ubg=built.upper)
+        stats = solve.stats()
         iterations += int(stats["iter_count"])
         if stats["success"]:
             break
     controls = np.asarray(result["x"]).ravel()[:-6].reshape(-1, 8)[:, 6:]
-    return _Solved(controls, float(result["f"]), bool(stats["success"]), solver, iterations)
+    return _Solved(controls, float(result["f"]), bool(stats["success"]), name, iterations)
 
 
 def _judged(
@@ -211,26 +216,31 @@ def _least_bad(planner: Planner, scene: Scene) -> Plan:
 def _from_start(begun: Plan, t: Floats) -> Floats:
     """s, s', s'', d, d', d'' (K, 6) of a plan at times t, s from its start on."""
     told = np.hstack([begun.along(t), begun.lateral.motion.at(t)[0]])
-    told[0, 1:3] = begun.start.ds, begun.start.dds
     told[:, 0] -= begun.start.s
     return told
 
 
-def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str, Floats], float]:
+def _packed(states: Floats, stage: float) -> Floats:
+    """The decision variables of states (N + 1, 6), with mean jerks between them."""
+    jerks = np.diff(states[:, [2, 5]], axis=0) / stage
+    return np.concatenate([np.hstack([states[:-1], jerks]).ravel(), states[-1]])
+
+
+def _posed(planner: Planner, scene: Scene, begun: Plan, per_stage: int) -> tuple[Shape, dict[str, Floats], float]:
     """The shape of a plan's problem, its parameters by name, and the error of the line as told to it [m]."""
-    num_stages = -(-planner.num_steps // PER_STAGE)
-    stage = PER_STAGE * planner.step
+    num_stages = -(-planner.num_steps // per_stage)
+    stage = per_stage * planner.step
     horizon = num_stages * stage
     ends = stage * (np.arange(1.0, num_stages + 1.0))
     centre, pace = _from_start(begun, ends)[:, :2].T
     width = FREE[0] + FREE[1] * (ends / horizon) ** 2 + pace * stage
     line, origin, error = _line(scene.line, scene.state.s, centre, width)
-    rows = _near(planner, scene, begun, planner.radius + error, num_stages * PER_STAGE)
+    rows = _near(planner, scene, begun, planner.radius + error, num_stages * per_stage)
     rows[..., :2] -= origin
     walls = corridor(planner, scene, begun, ends) if len(scene.boundary.segment) else None
     shape = Shape(
         num_stages,
-        PER_STAGE,
+        per_stage,
         planner.step,
         tuple(map(float, planner.vehicle.circles)),
         planner.weights,
@@ -240,7 +250,8 @@ def _posed(planner: Planner, scene: Scene, begun: Plan) -> tuple[Shape, dict[str
         False,
     )
     arrivals = np.array([begun.longitudinal.duration[0], begun.lateral.motion.duration[0]])
-    left = np.maximum(arrivals - horizon, planner.fans.soonest)
+    left = arrivals - horizon
+    left = np.where(left < SOONEST, planner.fans.soonest, left)
     if isinstance(scene.goal, Reach):
         place, speed = scene.goal.target(horizon + left[0])
         wanted, moving = float(place) - scene.state.s, float(speed)

@@ -21,15 +21,16 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from planning.candidates import Weights
-from planning.kinematics import GUARDED, LIMITS, MARGINS, PLACED
+from planning.kinematics import GUARDED, LIMITS, MARGINS, PLACED, path
 from planning.polynomials import QUARTIC, QUINTIC, SQUARED_JERK
 from planning.shapes import OUTLINE
 
 CURVATURE, PLACE = 6, 7  # coefficients of the line's curvature, and of its x and y, in z
 KEPT, SETTLED = 0.005, 0.5  # a share of each limit is kept free, from that time on [s]: the line is told with errors
 STEADY = 0.02  # of the curvature's rate, kept free: it varies within a stage
+SLOWEST, AT_REST = 0.5, 0.2  # [m/s] s' at least, for directions are undefined at rest; beside v in the curvature
 TOLERANCE = 1e-4  # of optimality
-MOST = 100  # iterations
+MOST = 80  # iterations
 ACROSS, TO_SPEED, TO_PLACE = "across", "to a speed", "to a place"
 
 
@@ -59,16 +60,18 @@ class Shape(NamedTuple):
         return self.per_stage * self.step
 
 
-class Problem(NamedTuple):
-    """solvers {name: casadi.Function}; parameters {name: (rows, columns)} in their order; `objective` a function
-    (w, p) of the decision variables (x_0, u_0, x_1, ..., x_N) and the parameters; bounds of the constraints."""
+SOLVERS = ("fatrop", "ipopt")  # the second where the first fails
 
-    solvers: dict[str, Any]
+
+class Problem(NamedTuple):
+    """programme {x, p, f, g}: decision variables (x_0, u_0, x_1, ..., x_N), parameters, cost and constraints, which are
+    equalities or not and lie between lower and upper; parameters {name: (rows, columns)} in their order."""
+
+    programme: dict[str, Any]
     parameters: dict[str, tuple[int, int]]
-    objective: Any
-    constraints: Any
-    lower: Any
-    upper: Any
+    equality: list[bool]
+    lower: list[float]
+    upper: list[float]
 
 
 def advance(x: Any, u: Any, h: float) -> list[Any]:
@@ -106,7 +109,7 @@ def closing(kind: str, weights: Weights) -> Any:
 
 @lru_cache
 def problem(shape: Shape) -> Problem:
-    """The programme of a shape; about a second, once."""
+    """The programme of a shape."""
     import casadi as ca
 
     parameters = {
@@ -151,32 +154,23 @@ def problem(shape: Shape) -> Problem:
     w = ca.vertcat(*(part for pair in zip(states, controls, strict=False) for part in pair), final)
     g, vector = ca.vertcat(*constraints), ca.vertcat(*(ca.vec(p[name]) for name in parameters))
     programme = {"x": w, "p": vector, "f": cost, "g": g}
-    quiet: dict[str, Any] = {"print_time": False, "error_on_fail": False}
-    solvers = {
-        "fatrop": ca.nlpsol(
-            "fatrop",
-            "fatrop",
-            programme,
-            quiet
-            | {"structure_detection": "auto", "equality": equal}
-            | {"fatrop": {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST, "tol": TOLERANCE}},
-        ),
-        "ipopt": ca.nlpsol(
-            "ipopt",
-            "ipopt",
-            programme,
-            quiet | {"ipopt": {"print_level": 0, "sb": "yes", "mu_init": 1e-2, "max_iter": MOST, "tol": TOLERANCE}},
-        ),
-    }
     upper = [0.0 if same else ca.inf for same in equal]
-    return Problem(
-        solvers,
-        parameters,
-        ca.Function("objective", [w, vector], [cost]),
-        ca.Function("constraints", [w, vector], [g]),
-        [0.0] * len(equal),
-        upper,
-    )
+    programme = {"x": w, "p": vector, "f": cost, "g": g}
+    return Problem(programme, parameters, equal, [0.0] * len(equal), upper)
+
+
+@lru_cache
+def solver(shape: Shape, name: str) -> Any:
+    """The casadi.Function that solves it: "fatrop" or "ipopt". It takes about a second, once."""
+    import casadi as ca
+
+    built, own = problem(shape), {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST, "tol": TOLERANCE}
+    options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+    if name == "fatrop":
+        options |= {"structure_detection": "auto", "equality": built.equality}
+    else:
+        own |= {"sb": "yes"}
+    return ca.nlpsol(name, name, built.programme, options | {name: own})
 
 
 def _kept(shape: Shape, p: dict[str, Any], k: int, x: list[Any]) -> list[Any]:
@@ -185,7 +179,7 @@ def _kept(shape: Shape, p: dict[str, Any], k: int, x: list[Any]) -> list[Any]:
     share = 1.0 - KEPT * min(k * shape.stage / SETTLED, 1.0)
     margins = _margins(p, x, line, share)[: len(GUARDED)]
     clear = _clear(shape, p, k - 1, shape.per_stage * k - 1, x, line)
-    return [*margins, 1 - line.z, 1 + line.z, p["last"][0] - x[0], *clear]
+    return [*margins, x[1] - SLOWEST, 1 - line.z, 1 + line.z, p["last"][0] - x[0], *clear]
 
 
 def _kept_within(shape: Shape, p: dict[str, Any], k: int, x: list[Any], u: list[Any]) -> list[Any]:
@@ -195,8 +189,8 @@ def _kept_within(shape: Shape, p: dict[str, Any], k: int, x: list[Any], u: list[
         y = advance(x, u, (i + 1) * shape.step)
         told += _clear(shape, p, k, shape.per_stage * k + i, y, _line(p["line"][:, k], y[0]))
     y = advance(x, u, shape.stage)
-    before = _margins(p, x, _line(p["line"][:, k], x[0]), 1.0)[-1] if k else p["bent"]
-    turned = (_margins(p, y, _line(p["line"][:, k], y[0]), 1.0)[-1] - before) / shape.stage
+    before = _curvature(x, _line(p["line"][:, k], x[0])) if k else p["bent"]
+    turned = (_curvature(y, _line(p["line"][:, k], y[0])) - before) / shape.stage
     allowed = (1.0 - STEADY) * p["rate"]
     return [*told, allowed - turned, allowed + turned]
 
@@ -235,6 +229,14 @@ def _margins(p: dict[str, Any], y: list[Any], line: _Line, share: float) -> list
 
     x = ca.vertcat(y[1], y[2], line.kappa, line.slope, *y[3:])
     return list(ca.vertsplit(MARGINS.casadi()(x, share * p["limits"])))
+
+
+def _curvature(y: list[Any], line: _Line) -> Any:
+    """Of the path; too small near rest, where it would be infinite (and where solvers do not come back from)."""
+    import casadi as ca
+
+    v, _, cross, _ = path([y[1], y[2], line.kappa, line.slope, *y[3:]], ca)
+    return cross / (v**3 + AT_REST**3)
 
 
 def _clear(shape: Shape, p: dict[str, Any], k: int, at: int, y: list[Any], line: _Line) -> list[Any]:

@@ -150,6 +150,7 @@ def _refined(planner: Planner, scene: Scene, found: Plan, per_stage: int) -> Ref
         solved = _solved(shape, given, guess)
         iterations += solved.iterations
         if not solved.converged:
+            told = told._replace(solver=solved.solver)
             break
         told = _judged(planner, scene, found, begun, shape, given, solved, error)
         if told.accepted or told.why == DEARER:

@@ -30,7 +30,7 @@ KEPT, SETTLED = 0.005, 0.5  # a share of each limit is kept free, from that time
 STEADY = 0.02  # of the curvature's rate, kept free: it varies within a stage
 SLOWEST, AT_REST = 0.5, 0.2  # [m/s] s' at least, for directions are undefined at rest; beside v in the curvature
 TOLERANCE = 1e-4  # of optimality
-MOST = 80  # iterations
+MOST = {"fatrop": 60, "ipopt": 40}  # iterations
 ACROSS, TO_SPEED, TO_PLACE = "across", "to a speed", "to a place"
 
 
@@ -164,7 +164,7 @@ def solver(shape: Shape, name: str) -> Any:
     """The casadi.Function that solves it: "fatrop" or "ipopt". It takes about a second, once."""
     import casadi as ca
 
-    built, own = problem(shape), {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST, "tol": TOLERANCE}
+    built, own = problem(shape), {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST[name], "tol": TOLERANCE}
     options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     if name == "fatrop":
         options |= {"structure_detection": "auto", "equality": built.equality}

@@ -1,7 +1,7 @@
 """A plan made better by optimal control: the same costs and limits, all motions instead of a fan of polynomials.
 
     found = plan(planner, scene, previous, elapsed)
-    better = refine(planner, scene, found)           # better.states(t), better.trajectory(t): what to follow
+    better = refine(planner, scene, found, better, elapsed)     # better.states(t), better.trajectory(t): to follow
 
 The problem is that of planning.optimal_problem, solved by fatrop (an interior-point method for problems in stages) and,
 where that fails, by IPOPT, from the candidate. What comes out is judged step by step by the code that judges
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning import optimal_problem as problem
-from planning.candidates import Keep, Reach
+from planning.candidates import Keep, Reach, Weights
 from planning.corridor import corridor
 from planning.frenet import FrenetState, to_pose
 from planning.kinematics import LIMITS, PLACED
@@ -26,6 +26,7 @@ from planning.optimal_problem import ACROSS, CURVATURE, PLACE, TO_PLACE, TO_SPEE
 from planning.planner import (
     COMFORT,
     EMERGENCY,
+    ON_PLAN,
     RELAXED,
     Plan,
     Planner,
@@ -38,7 +39,7 @@ from planning.planner import (
     rectangles,
     state_of,
 )
-from planning.polynomials import NOTHING, Polynomials, quartics, quintics
+from planning.polynomials import NOTHING, Polynomials, quartics, quintics, squared_jerk
 from planning.reference import ReferenceLine
 from planning.shapes import OUTLINE, outlines
 
@@ -51,27 +52,50 @@ FREE = (2.0, 8.0)  # how far the motion may be ahead of or behind the candidate,
 SOONEST = 0.45  # [s] after the horizon that the candidate's end is kept; nearer ones are put off: all but a constraint
 NODES = 14  # of the line in a stage's stretch
 SHORT = 1e-3  # of the last place allowed [m]
+STAY = 0.02  # by which the rest of the last motion may cost more than the best one found now
 DEARER = "costs more"
 FAR = 1e3  # [m], of what is not there
 
 
 class Motion(NamedTuple):
-    """Constant jerk over stages of `stage` seconds, then a polynomial.
+    """Constant jerk over stages of `stage` seconds, then a polynomial; of which `gone` seconds are over.
 
-    states (N + 1, 3), jerk (N,)"""
+    states (N + 1, 3), jerk (N,); price (N + 1,) of the squared jerk in each stage and in the tail; arrival  of the
+    candidate that it was made from [s]"""
 
     stage: float
     states: Floats
     jerk: Floats
     tail: Polynomials
+    price: Floats
+    arrival: float
+    gone: float = 0.0
+
+    @property
+    def horizon(self) -> float:
+        """Where the tail begins [s]."""
+        return len(self.jerk) * self.stage
+
+    def end(self) -> tuple[float, float, float]:
+        """q, q' at the tail's end, and when that is."""
+        q, first = self.tail.end()[0]
+        return float(q), float(first), self.horizon + float(self.tail.duration[0]) - self.gone
+
+    def price_left(self, weights: Weights) -> float:
+        """k_j int(price jerk^2) + k_t T of what is left."""
+        ends = self.stage * np.arange(1.0, len(self.jerk) + 1.0)
+        left = np.clip(ends - self.gone, 0.0, self.stage)
+        tail = squared_jerk(self.tail.later(max(self.gone - self.horizon, 0.0)))[0]
+        jerk = (self.price[:-1] * left * self.jerk**2).sum() + self.price[-1] * tail
+        return float(weights.jerk * jerk + weights.time * max(self.arrival - self.gone, 0.0))
 
     def at(self, t: Floats) -> Floats:
         """q, q', q'' (K, 3) at times t (K,)."""
-        n = len(self.jerk)
+        t, n = t + self.gone, len(self.jerk)
         k = np.minimum((t / self.stage + 1e-9).astype(np.int64), n - 1)
         told = np.stack(problem.advance(self.states[k].T, [self.jerk[k]], t - k * self.stage), -1)  # type: ignore[arg-type]
-        beyond = t > n * self.stage
-        told[beyond] = self.tail.at(t[beyond] - n * self.stage)[0]
+        beyond = t > self.horizon
+        told[beyond] = self.tail.at(t[beyond] - self.horizon)[0]
         return told
 
 
@@ -84,6 +108,7 @@ class Refined(NamedTuple):
     cost, candidate_cost  of both by the same functional; NaN without a motion
     solver    that made it, or that failed last; `iterations` of all solvers
     line_error  of the line as told to the solver [m]
+    rest      whether the motion followed is what is left of the last one
     """
 
     plan: Plan
@@ -97,6 +122,7 @@ class Refined(NamedTuple):
     converged: bool = False
     iterations: int = 0
     line_error: float = math.nan
+    rest: bool = False
 
     @property
     def tier(self) -> str:
@@ -121,18 +147,56 @@ class Refined(NamedTuple):
         return np.array([to_pose(self.plan.line, state) for state in self.states(t)])
 
 
-def refine(planner: Planner, scene: Scene, found: Plan, *, per_stage: int = PER_STAGE) -> Refined:
+def refine(
+    planner: Planner,
+    scene: Scene,
+    found: Plan,
+    previous: Refined | None = None,
+    elapsed: float = 0.0,
+    *,
+    per_stage: int = PER_STAGE,
+) -> Refined:
     """The plan of this scene, or a better motion: it costs no more, or it is comfortable where no candidate was.
 
-    per_stage  of the planner's steps, in which jerk is constant
+    previous, elapsed  the last refinement, if the vehicle follows it, and the time since its start [s]
+    per_stage          of the planner's steps, in which jerk is constant
 
-    Nothing is raised for what a solver does: the candidate stays. The next plan is made with `found` as the previous
-    one, of which there is no rest where the vehicle follows a refined motion: the horizon recedes, so that consecutive
-    refined motions differ where something is still to be mended at its end."""
+    A horizon that recedes finds another best motion in every cycle. So what is left of the last one is followed as long
+    as it is good, costs no more than the candidate, and no more than STAY beyond the best motion found now.
+    Nothing is raised for what a solver does: the candidate stays."""
     try:
-        return _refined(planner, scene, found, per_stage)
+        told = _refined(planner, scene, found, per_stage)
     except (RuntimeError, ArithmeticError, np.linalg.LinAlgError) as failure:  # CasADi raises RuntimeError
-        return Refined(found, False, f"the solver failed: {failure}")
+        told = Refined(found, False, f"the solver failed: {failure}")
+    rest = _rest(planner, scene, found, previous, elapsed)
+    if rest is None or (told.accepted and rest.cost > (1.0 + STAY) * told.cost):
+        return told
+    return rest._replace(iterations=told.iterations)
+
+
+def _rest(planner: Planner, scene: Scene, found: Plan, previous: Refined | None, elapsed: float) -> Refined | None:
+    """What is left of the last refined motion, by today's targets, where it is good and costs no more than the plan."""
+    if previous is None or previous.along is None or previous.across is None or not previous.accepted:
+        return None
+    if previous.plan.line.table is not scene.line.table:
+        return None
+    if not np.allclose(previous.states([elapsed])[0], scene.state, rtol=0.0, atol=ON_PLAN):
+        return None
+    along = previous.along._replace(gone=previous.along.gone + elapsed)
+    across = previous.across._replace(gone=previous.across.gone + elapsed)
+    weights, (place, speed, when), (offset, _, _) = planner.weights, along.end(), across.end()
+    off = scene.goal.costs(np.array(place), np.array(speed), np.array(max(when, 0.0)))
+    cost = weights.longitudinal * (along.price_left(weights) + weights.along * float(off))
+    cost += weights.lateral * (across.price_left(weights) + weights.across * (offset - scene.wanted) ** 2)
+    if when < 0.0 or _broken(planner, scene, along, across) != "none" or (found.tier == COMFORT and cost > found.cost):
+        return None
+    return previous._replace(plan=found, along=along, across=across, cost=cost, candidate_cost=found.cost, rest=True)
+
+
+def _broken(planner: Planner, scene: Scene, along: Motion, across: Motion) -> str:
+    """What a motion breaks, or "none"."""
+    t = planner.step * np.arange(1.0, planner.num_steps + 1.0)
+    return judge_states(planner, scene, along.at(t), across.at(t), planner.comfort)[0]
 
 
 def _refined(planner: Planner, scene: Scene, found: Plan, per_stage: int) -> Refined:
@@ -193,15 +257,12 @@ def _judged(
     error: float,
 ) -> Refined:
     """Whether a solution is followed."""
-    along, across = _motions(shape, given["start"], solved.controls, given["ends"])
+    arrivals = float(begun.longitudinal.duration[0]), float(begun.lateral.motion.duration[0])
+    along, across = _motions(shape, given, solved.controls, arrivals)
     weights = planner.weights
-    cost = solved.cost + weights.time * (
-        weights.longitudinal * float(begun.longitudinal.duration[0])
-        + weights.lateral * float(begun.lateral.motion.duration[0])
-    )
+    cost = solved.cost + weights.time * (weights.longitudinal * arrivals[0] + weights.lateral * arrivals[1])
     along = _moved(along, scene.state.s)
-    t = planner.step * np.arange(1.0, planner.num_steps + 1.0)
-    why, _ = judge_states(planner, scene, along.at(t), across.at(t), planner.comfort)
+    why = _broken(planner, scene, along, across)
     if why == "none" and found.tier == COMFORT and not cost <= found.cost:
         why = DEARER
     return Refined(found, why == "none", why, along, across, cost, begun.cost, solved.solver, True, 0, error)
@@ -325,22 +386,24 @@ def _near(planner: Planner, scene: Scene, begun: Plan, radius: float, num_steps:
     return kept
 
 
-def _motions(shape: Shape, start: Floats, controls: Floats, ends: Floats) -> tuple[Motion, Motion]:
+def _motions(
+    shape: Shape, given: dict[str, Floats], controls: Floats, arrivals: tuple[float, float]
+) -> tuple[Motion, Motion]:
     """Along and across, from the start by the controls, and on to the ends that cost least."""
-    states = [start]
+    states, ends = [given["start"]], given["ends"]
     for u in controls:
         states.append(np.array(problem.advance(list(states[-1]), list(u), shape.stage)))
     told, made = np.array(states), list[Motion]()
     for i, kind in enumerate((shape.kind, ACROSS)):
         part = told[:, 3 * i : 3 * i + 3]
-        _, pace, left, _ = own = ends[4 * i : 4 * i + 4]
+        _, pace, left, price = own = ends[4 * i : 4 * i + 4]
         end = float(problem.closing(kind, shape.weights)(part[-1], own)[1])
         first = tuple(map(float, part[-1]))
         if kind == TO_SPEED:
             tail = quartics(first, [end], [left])
         else:
             tail = quintics(first, [[end, pace if kind == TO_PLACE else 0.0, 0.0]], [left])
-        made.append(Motion(shape.stage, part, controls[:, i], tail))
+        made.append(Motion(shape.stage, part, controls[:, i], tail, np.r_[given["price"][i], price], arrivals[i]))
     return made[0], made[1]
 
 

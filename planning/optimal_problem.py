@@ -153,7 +153,6 @@ def problem(shape: Shape) -> Problem:
 
     w = ca.vertcat(*(part for pair in zip(states, controls, strict=False) for part in pair), final)
     g, vector = ca.vertcat(*constraints), ca.vertcat(*(ca.vec(p[name]) for name in parameters))
-    programme = {"x": w, "p": vector, "f": cost, "g": g}
     upper = [0.0 if same else ca.inf for same in equal]
     programme = {"x": w, "p": vector, "f": cost, "g": g}
     return Problem(programme, parameters, equal, [0.0] * len(equal), upper)
@@ -164,7 +163,8 @@ def solver(shape: Shape, name: str) -> Any:
     """The casadi.Function that solves it: "fatrop" or "ipopt". It takes about a second, once."""
     import casadi as ca
 
-    built, own = problem(shape), {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST[name], "tol": TOLERANCE}
+    built = problem(shape)
+    own: dict[str, Any] = {"print_level": 0, "mu_init": 1e-2, "max_iter": MOST[name], "tol": TOLERANCE}
     options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     if name == "fatrop":
         options |= {"structure_detection": "auto", "equality": built.equality}

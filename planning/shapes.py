@@ -72,8 +72,8 @@ CLEARANCE = Formula("clearance", _clearance, 2, 11)
 
 
 ROUND = 6  # the exponent of the smooth outline: at 6 a car with circles of 1.35 m grows by 3 cm at its sides
-BEARINGS = 64  # at which it is fitted
-FITTED = 1.002  # what it is widened by, for the bearings between
+BEARINGS = 64  # of half a circle, at which it is fitted
+FITTED = 1.003  # what it is widened by, for the bearings between
 
 
 def _outline(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
@@ -95,7 +95,7 @@ def outlines(table: Floats, radius: float) -> Floats:
     A circle at q from the rectangle is just clear at |q| = radius + z sigma(q / |q|), so the outline must hold the
     rectangle's corners moved by that in every direction. Its half axes are those of that shape, scaled together by
     the largest value of the norm on it."""
-    bearing = 2 * np.pi * np.arange(BEARINGS) / BEARINGS
+    bearing = np.pi * np.arange(BEARINGS) / BEARINGS  # the other half is the same
     cos, sin = np.cos(bearing), np.sin(bearing)
     along, mixed, across, z = (table[..., k, None] for k in (6, 7, 8, 9))
     spread = along * cos**2 + 2 * mixed * cos * sin + across * sin**2

@@ -232,3 +232,57 @@ def test_a_refined_drive_stops_before_the_line() -> None:
         assert state.s + PLANNER.vehicle.front <= 70.0
     assert state.ds == pytest.approx(0.0, abs=0.01) and 70.0 - (state.s + PLANNER.vehicle.front) < 0.3
     assert accepted > 5
+
+
+@pytest.mark.parametrize("seed", [0, 19, 24])
+def test_all_of_a_refined_motion_is_its_own_rest(seed: int) -> None:
+    """Told again without any time gone, it costs what the solver said it does."""
+    given = random_scene(PLANNER, seed)
+    found = plan(PLANNER, given)
+    refined = refine(PLANNER, given, found)
+    again = refine(PLANNER, given, found, refined, 0.0)
+    assert refined.accepted and not refined.rest and again.rest
+    assert again.cost == pytest.approx(refined.cost, rel=1e-6)
+    np.testing.assert_array_equal(again.trajectory(T), refined.trajectory(T))
+
+
+def test_a_world_that_does_not_change_is_driven_as_refined_before() -> None:
+    state, previous, rest = START, None, 0
+    gaps = list[float]()
+    for cycle in range(20):
+        given = scene(state, Reach(45.0 + 8.0 * 0.15 * cycle, 8.0))
+        refined = refine(PLANNER, given, plan(PLANNER, given), previous, 0.15)
+        if previous is not None:
+            t = np.arange(0.0, 2.851, 0.05)
+            gaps.append(np.abs(refined.trajectory(t)[:, :2] - previous.trajectory(t + 0.15)[:, :2]).max())
+        state, previous, rest = refined.states([0.15])[0], refined, rest + refined.rest
+    assert rest >= 18 and np.quantile(gaps, 0.95) < 1e-9
+
+
+@pytest.mark.parametrize(
+    "change", [{"goal": Reach(52.0, 8.0)}, {"obstacles": rectangle(45.0, 0.5)}, {"stop": 45.0}, {"wanted": 2.0}]
+)
+def test_the_rest_is_not_followed_into_a_world_that_changed(change: dict[str, Any]) -> None:
+    given = scene(START, Reach(45.0, 8.0))
+    first = refine(PLANNER, given, plan(PLANNER, given))
+    same = scene(first.states([0.15])[0], Reach(45.0 + 8.0 * 0.15, 8.0))
+    changed = same._replace(**change)
+    assert refine(PLANNER, same, plan(PLANNER, same), first, 0.15).rest
+    assert not refine(PLANNER, changed, plan(PLANNER, changed), first, 0.15).rest
+
+
+def test_a_vehicle_that_left_its_motion_does_not_get_the_rest_of_it() -> None:
+    given = scene(START, Keep(12.0))
+    first = refine(PLANNER, given, plan(PLANNER, given))
+    state = first.states([0.15])[0]
+    moved = scene(state._replace(d=state.d + 0.05), Keep(12.0))
+    assert not refine(PLANNER, moved, plan(PLANNER, moved), first, 0.15).rest
+
+
+def test_what_the_solver_is_not_told_is_found_by_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = scene(START, Keep(10.0), obstacles=rectangle(50.0, 1.6))
+    found = plan(PLANNER, given)
+    monkeypatch.setattr(optimal, "NEAR", -10.0)
+    refined = refine(PLANNER, given, found)
+    assert refined.converged and not refined.accepted and refined.why == "other road user"
+    np.testing.assert_array_equal(refined.trajectory(T), found.trajectory(T))

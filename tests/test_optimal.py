@@ -286,3 +286,11 @@ def test_what_the_solver_is_not_told_is_found_by_the_check(monkeypatch: pytest.M
     refined = refine(PLANNER, given, found)
     assert refined.converged and not refined.accepted and refined.why == "other road user"
     np.testing.assert_array_equal(refined.trajectory(T), found.trajectory(T))
+
+
+def test_the_rest_gives_way_to_a_motion_that_is_much_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = scene(START, Reach(45.0, 8.0))
+    first = refine(PLANNER, given, plan(PLANNER, given))
+    assert refine(PLANNER, given, first.plan, first, 0.0).rest
+    monkeypatch.setattr(optimal, "STAY", -0.01)  # the motion found now is the same: 1 % too dear then
+    assert not refine(PLANNER, given, first.plan, first, 0.0).rest

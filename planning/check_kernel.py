@@ -12,12 +12,13 @@ import numpy as np
 from numba import njit
 
 from planning.boundary_kernel import first_line
-from planning.kinematics import GUARDED, MARGINS
+from planning.kinematics import GUARDED, MARGINS, PLACED
 from planning.reference_kernel import line_at
 from planning.shapes import CLEARANCE
 
 margins_of = MARGINS.scalar()
 clearance_of = CLEARANCE.scalar()
+placed = PLACED.scalar()
 
 NUM_MARGINS = len(GUARDED)
 GOOD = 0  # then 1 ... NUM_MARGINS for the margins
@@ -51,11 +52,19 @@ def polynomial(c, i, duration, t):  # type: ignore[no-untyped-def]
 def along_line(coefficients, duration, table, step, dt, out):  # type: ignore[no-untyped-def]
     """out (n, 9, K): s, s', s'', kappa, kappa', x, y, cos theta, sin theta of each motion at dt, 2 dt, ..."""
     for i in range(out.shape[0]):
+        for k in range(out.shape[2]):
+            out[i, 0, k], out[i, 1, k], out[i, 2, k] = polynomial(coefficients, i, duration[i], (k + 1) * dt)
+    add_line(table, step, out)
+
+
+@njit(cache=True, error_model="numpy")
+def add_line(table, step, out):  # type: ignore[no-untyped-def]
+    """Rows 3 to 8 of out (n, 9, K), the line at s, which is row 0."""
+    for i in range(out.shape[0]):
         row = out[i]
         for k in range(out.shape[2]):
-            s, ds, dds = polynomial(coefficients, i, duration[i], (k + 1) * dt)
-            x, y, theta, kappa, slope = line_at(table, step, s)
-            row[0, k], row[1, k], row[2, k], row[3, k], row[4, k] = s, ds, dds, kappa, slope
+            x, y, theta, kappa, slope = line_at(table, step, row[0, k])
+            row[3, k], row[4, k] = kappa, slope
             row[5, k], row[6, k], row[7, k], row[8, k] = x, y, math.cos(theta), math.sin(theta)
 
 
@@ -129,11 +138,9 @@ def first_turn(speed, curvature, start, most):  # type: ignore[no-untyped-def]
 def in_plane(a, d, pose):  # type: ignore[no-untyped-def]
     """pose (4, K): x, y, cos and sin of the heading."""
     for k in range(pose.shape[1]):
-        ahead, aside = a[1, k] * (1.0 - a[3, k] * d[0, k]), d[1, k]
-        n = math.sqrt(ahead * ahead + aside * aside)
-        t0, t1 = (ahead / n, aside / n) if n > 1e-6 else (1.0, 0.0)
-        pose[0, k], pose[1, k] = a[5, k] - d[0, k] * a[8, k], a[6, k] + d[0, k] * a[7, k]
-        pose[2, k], pose[3, k] = a[7, k] * t0 - a[8, k] * t1, a[8, k] * t0 + a[7, k] * t1
+        pose[0, k], pose[1, k], pose[2, k], pose[3, k] = placed(
+            a[1, k], a[3, k], d[0, k], d[1, k], a[5, k], a[6, k], a[7, k], a[8, k]
+        )
 
 
 @njit(error_model="numpy")

@@ -49,6 +49,21 @@ def _told(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
 KINEMATICS = Formula("kinematics", _told, 7)  # -> speed, acceleration along, curvature of the path, w
 
 
+def _placed(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
+    ds, kappa, d, dd, line_x, line_y, line_cos, line_sin = x
+    vx = ds * (1.0 - kappa * d)
+    squared = vx * vx + dd * dd
+    moves = squared > STILL
+    v = ops.sqrt(ops.where(moves, squared, 1.0))
+    ahead, left = ops.where(moves, vx / v, 1.0), ops.where(moves, dd / v, 0.0)
+    cos, sin = line_cos * ahead - line_sin * left, line_sin * ahead + line_cos * left
+    return line_x - d * line_sin, line_y + d * line_cos, cos, sin
+
+
+# (s', kappa, d, d'; x, y, cos theta, sin theta of the line) -> x, y, cos and sin of the heading; at rest the line's
+PLACED = Formula("placed", _placed, 8)
+
+
 @dataclass(frozen=True)
 class Limits:
     """What a vehicle may do.

@@ -135,11 +135,7 @@ class Plan(NamedTuple):
 
     def along(self, t: Floats) -> Floats:
         """s, s', s'' (K, 3), never backwards."""
-        told = self.longitudinal.at(t)[0]
-        still = (told[:, 1] < 0.0) | (np.maximum.accumulate(told[:, 0]) > told[:, 0])
-        told[:, 0] = np.maximum.accumulate(told[:, 0])
-        told[still, 1:] = 0.0
-        return told
+        return forwards(self.longitudinal.at(t)[0])
 
     def states(self, t: Sequence[float] | Floats) -> list[FrenetState]:
         """Where the vehicle is along the line at times t after the start."""
@@ -148,14 +144,24 @@ class Plan(NamedTuple):
             across = self.lateral.motion.at(along[:, 0] - self.start.s)[0]
             return [FrenetState(*map(float, (*a, *d))) for a, d in zip(along, across, strict=True)]
         across = self.lateral.motion.at(np.asarray(t, float))[0]
-        return [_by_way(a, d) for a, d in zip(along, across, strict=True)]
+        return [state_of(a, d) for a, d in zip(along, across, strict=True)]
 
     def trajectory(self, t: Sequence[float] | Floats) -> Floats:
         """x, y, heading, speed, acceleration, curvature (K, 6) at times t after the start."""
         return np.array([to_pose(self.line, state) for state in self.states(t)])
 
 
-def _by_way(along: Floats, across: Floats) -> FrenetState:
+def forwards(along: Floats) -> Floats:
+    """s, s', s'' (K, 3) at rising times, standing where they would go back."""
+    told = along.copy()
+    still = (told[:, 1] < 0.0) | (np.maximum.accumulate(told[:, 0]) > told[:, 0])
+    told[:, 0] = np.maximum.accumulate(told[:, 0])
+    told[still, 1:] = 0.0
+    return told
+
+
+def state_of(along: Floats, across: Floats) -> FrenetState:
+    """The state of s, s', s'' and d, d', d'' in time; at rest the line's direction."""
     s, ds, dds = map(float, along)
     d, dd, ddd = map(float, across)
     if ds < SLOWEST:
@@ -178,13 +184,13 @@ def plan(
     judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
     rejected = turned_down(judged)
     if judged.best >= 0:
-        return _chosen(scene, judged, judged.best, COMFORT, rejected)
+        return chosen(scene, judged, judged.best, COMFORT, rejected)
     relaxed = judge(planner, scene, made, planner.able)
     if relaxed.best >= 0:
-        return _chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
+        return chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
     stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able)
     best = stops.best if stops.best >= 0 else least_harm(planner, stops)
-    return _chosen(scene, stops, best, EMERGENCY, rejected)
+    return chosen(scene, stops, best, EMERGENCY, rejected)
 
 
 def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0) -> Candidates:
@@ -218,22 +224,59 @@ def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, f
     """Candidates with reasons, cheapest first, up to the first good one (all of them unless `first_good`)."""
     from planning import check_kernel as kernel
 
-    vehicle, dt = planner.vehicle, planner.step
+    dt = planner.step
     ahead = np.empty((len(made.longitudinal.cost), 9, planner.num_steps))
     kernel.along_line(*made.longitudinal.motion, scene.line.table, scene.line.step, dt, ahead)
     across = np.empty((len(made.lateral.cost), 3, planner.num_steps))
     kernel.across_line(*made.lateral.motion, dt, across)
-    reach = math.hypot(vehicle.length / 2, vehicle.width / 2) + planner.radius  # generous: circles stand out
-    each = planner.risk / max(len(scene.obstacles.probability), 1)
-    reason, when = np.full(made.cost.size, -1), np.zeros(made.cost.size, np.int64)
+    lateral = made.lateral
+    best, reason, when = _judged(
+        planner, scene, limits, made.order, ahead, across, lateral.by_way, lateral.motion, first_good
+    )
+    return made._replace(best=best, reason=reason, when=when)
+
+
+def judge_states(planner: Planner, scene: Scene, along: Floats, across: Floats, limits: Limits) -> tuple[str, int]:
+    """Why a motion is bad (a word of planning.check_kernel.REASONS, "none" where it is good) and at which step.
+
+    along, across  (K, 3): s, s', s'' and d, d', d'' at the horizon's steps without the first"""
+    from planning import check_kernel as kernel
+
+    ahead = np.empty((1, 9, planner.num_steps))
+    ahead[0, :3] = along.T
+    kernel.add_line(scene.line.table, scene.line.step, ahead)
+    unused = Polynomials(np.zeros((1, 6)), np.zeros(1))  # coefficients: only of motions told by the way
+    order, by_way = np.zeros(1, np.int64), np.zeros(1, np.bool_)
+    told = np.ascontiguousarray(across.T)[None]
+    _, reason, when = _judged(planner, scene, limits, order, ahead, told, by_way, unused, True)
+    return kernel.REASONS[reason[0]], int(when[0])
+
+
+def _judged(
+    planner: Planner,
+    scene: Scene,
+    limits: Limits,
+    order: NDArray[np.int64],
+    ahead: Floats,
+    across: Floats,
+    by_way: NDArray[np.bool_],
+    ways: Polynomials,
+    first_good: bool,
+) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
+    """The first good one, or -1; reason and when of all."""
+    from planning import check_kernel as kernel
+
+    vehicle = planner.vehicle
+    count = len(ahead) * len(across)
+    reason, when = np.full(count, -1), np.zeros(count, np.int64)
     best = kernel.judge(
-        made.order,
+        order,
         ahead,
         across,
-        made.lateral.by_way,
-        *made.lateral.motion,
+        by_way,
+        *ways,
         np.array([scene.state.s, to_pose(scene.line, scene.state).curvature]),
-        dt,
+        planner.step,
         np.array([getattr(limits, name) for name in LIMITS]),
         limits.curvature_rate,
         scene.line.length,
@@ -241,7 +284,7 @@ def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, f
         scene.stand - vehicle.front,
         limits.braking,
         tuple(scene.boundary[:6]),
-        scene.obstacles.table(each, planner.radius, reach),
+        rectangles(planner, scene),
         vehicle.middle,
         vehicle.circles,
         planner.radius,
@@ -249,7 +292,15 @@ def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, f
         reason,
         when,
     )
-    return made._replace(best=best, reason=reason, when=when)
+    return best, reason, when
+
+
+def rectangles(planner: Planner, scene: Scene) -> Floats:
+    """The obstacles' table, with the planner's risk shared among them."""
+    vehicle = planner.vehicle
+    reach = math.hypot(vehicle.length / 2, vehicle.width / 2) + planner.radius  # generous: circles stand out
+    each = planner.risk / max(len(scene.obstacles.probability), 1)
+    return scene.obstacles.table(each, planner.radius, reach)
 
 
 def turned_down(judged: Candidates) -> dict[str, int]:
@@ -318,7 +369,8 @@ def least_harm(planner: Planner, judged: Candidates) -> int:
     return int(np.lexsort((judged.cost, speed[i, judged.when], judged.reason < BOUNDARY))[0])
 
 
-def _chosen(scene: Scene, judged: Candidates, best: int, tier: str, rejected: dict[str, int]) -> Plan:
+def chosen(scene: Scene, judged: Candidates, best: int, tier: str, rejected: dict[str, int]) -> Plan:
+    """The plan that is candidate `best`."""
     i, j = divmod(best, len(judged.lateral.cost))
     ahead = judged.longitudinal.motion.take([i])
     across = Lateral(

@@ -71,6 +71,41 @@ def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
 CLEARANCE = Formula("clearance", _clearance, 2, 11)
 
 
+ROUND = 6  # the exponent of the smooth outline: at 6 a car with circles of 1.35 m grows by 3 cm at its sides
+BEARINGS = 64  # of half a circle, at which it is fitted
+FITTED = 1.003  # what it is widened by, for the bearings between
+
+
+def _outline(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
+    px, py = x
+    ox, oy, cos, sin, half_length, half_width = p
+    u = ((px - ox) * cos + (py - oy) * sin) / half_length
+    v = ((py - oy) * cos - (px - ox) * sin) / half_width
+    uu, vv = u * u, v * v
+    return (ops.log(uu * uu * uu + vv * vv * vv + 1e-12) / ROUND,)
+
+
+# log of the norm (|u|^6 + |v|^6)^(1/6), negative inside an outline that holds all x where CLEARANCE <= 0
+OUTLINE = Formula("outline", _outline, 2, 6)
+
+
+def outlines(table: Floats, radius: float) -> Floats:
+    """p (..., 6) of OUTLINE, for rows (..., 11) of Obstacles.table and circles of a radius [m].
+
+    A circle at q from the rectangle is just clear at |q| = radius + z sigma(q / |q|), so the outline must hold the
+    rectangle's corners moved by that in every direction. Its half axes are those of that shape, scaled together by
+    the largest value of the norm on it."""
+    bearing = np.pi * np.arange(BEARINGS) / BEARINGS  # the other half is the same
+    cos, sin = np.cos(bearing), np.sin(bearing)
+    along, mixed, across, z = (table[..., k, None] for k in (6, 7, 8, 9))
+    spread = along * cos**2 + 2 * mixed * cos * sin + across * sin**2
+    far = radius + z * np.sqrt(np.maximum(spread, 0.0))
+    x, y = table[..., 4, None] + far * np.abs(cos), table[..., 5, None] + far * np.abs(sin)
+    half = np.stack([x.max(-1), y.max(-1)], -1)
+    norm = ((x / half[..., :1]) ** ROUND + (y / half[..., 1:]) ** ROUND).max(-1) ** (1 / ROUND)
+    return np.concatenate([table[..., :4], half * FITTED * norm[..., None]], -1)
+
+
 class Obstacles(NamedTuple):
     """M rectangles at K times, the horizon's steps without the first, and how likely each is met.
 

@@ -13,7 +13,7 @@ from planning.candidates import Goal, Keep, Reach, follow, merge, stop
 from planning.check_kernel import REASONS
 from planning.frenet import FrenetState
 from planning.kinematics import KINEMATICS, LIMITS, MARGINS, Limits
-from planning.planner import COMFORT, EMERGENCY, RELAXED, Plan, Planner, Scene, candidates_of, judge, plan
+from planning.planner import COMFORT, EMERGENCY, RELAXED, Plan, Planner, Scene, candidates_of, judge, judge_states, plan
 from planning.polynomials import NOTHING, Polynomials
 from planning.reference import from_curvature
 from planning.shapes import CLEARANCE, Obstacles, Vehicle, boundary, no_obstacles
@@ -154,6 +154,20 @@ def test_every_judgement_is_that_of_the_formulas(speed: float) -> None:
     first = judge(PLANNER, given, candidates_of(PLANNER, given), limits)
     good = found.reason == 0
     assert first.best == (found.order[good[found.order]][0] if good.any() else -1)
+
+
+def test_a_motion_told_as_states_is_judged_like_a_candidate() -> None:
+    given = scene(START, Keep(14.0), offsets=np.linspace(-2.0, 3.5, 6), obstacles=rectangle(45.0, 1.0, 3.0, 0.2))
+    limits = Limits(speed=12.0, acceleration=2.2, curvature_rate=0.1)
+    found = judge(PLANNER, given, candidates_of(PLANNER, given), limits, first_good=False)
+    t, reasons = 0.05 * np.arange(1, 61), set[str]()
+    for c in np.random.default_rng(0).permutation(found.cost.size)[:60]:
+        i, j = divmod(int(c), len(found.lateral.cost))
+        along, across = found.longitudinal.motion.take([i]).at(t)[0], found.lateral.motion.take([j]).at(t)[0]
+        told = judge_states(PLANNER, given, along, across, limits)
+        assert told == (REASONS[found.reason[c]], found.when[c])
+        reasons.add(told[0])
+    assert len(reasons) >= 3, reasons
 
 
 def test_a_lead_vehicle_is_followed_at_the_gap_wanted() -> None:

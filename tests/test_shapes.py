@@ -13,7 +13,7 @@ from shapely import affinity
 
 from models.program import InputError
 from planning.boundary_kernel import first_line
-from planning.shapes import CLEARANCE, Boundary, Obstacles, Vehicle, boundary
+from planning.shapes import CLEARANCE, OUTLINE, ROUND, Boundary, Obstacles, Vehicle, boundary, outlines
 
 VEHICLE = Vehicle()
 
@@ -113,3 +113,37 @@ def test_no_lines_and_lines_far_away_touch_nothing() -> None:
 def test_lines_that_are_none_are_refused(line: np.ndarray) -> None:
     with pytest.raises(InputError, match="boundary line 0"):
         boundary([line], 1.0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    length=st.floats(0.3, 15), width=st.floats(0.3, 4), radius=st.floats(0.5, 2.0), std=st.floats(0, 2),
+    ratio=st.floats(0, 1), turn=st.floats(-4, 4), seed=st.integers(0, 1000),
+)  # fmt: skip
+def test_the_smooth_outline_is_never_more_optimistic_than_the_clearance(
+    length: float, width: float, radius: float, std: float, ratio: float, turn: float, seed: int
+) -> None:
+    axes = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    covariance = axes @ np.diag([std**2, (ratio * std) ** 2]) @ axes.T
+    body = Obstacles(
+        np.array([[[1.0, 2.0, 0.7]]]), np.array([[length, width]]), covariance[None, None], np.array([0.6])
+    )
+    row = body.table(1e-3, radius, 3.0)[0, :, 0]
+    smooth = outlines(row, radius)
+    rng = np.random.default_rng(seed)
+    bearing = rng.uniform(0, 2 * math.pi, 2000)
+    edge = smooth[4:] * np.stack([np.cos(bearing), np.sin(bearing)], -1)
+    edge /= (np.abs(edge / smooth[4:]) ** ROUND).sum(1)[:, None] ** (1 / ROUND)
+    turned = np.array([[smooth[2], -smooth[3]], [smooth[3], smooth[2]]])
+    centres = row[:2] + edge @ turned.T  # on the outline
+    assert np.abs(OUTLINE(centres, smooth[None])).max() < 1e-9
+    assert margins(row, centres, radius).min() > 0.0
+    inside = rng.normal(0, 0.4, (2000, 2)) * smooth[4:]
+    centres = row[:2] + inside @ turned.T
+    assert (OUTLINE(centres, smooth[None])[:, 0] <= 0.0)[margins(row, centres, radius) <= 0.0].all()
+
+
+def test_the_smooth_outline_of_a_car_costs_centimetres_at_its_sides() -> None:
+    body = Obstacles(np.zeros((1, 1, 3)), np.array([[4.6, 1.9]]), np.zeros((1, 1, 2, 2)), np.ones(1))
+    half = outlines(body.table(1e-3, 1.35, 5.0)[0, :, 0], 1.35)[4:]
+    assert (half - [2.3 + 1.35, 0.95 + 1.35]).max() < 0.06

@@ -30,6 +30,7 @@ from planning.shapes import Obstacles
 Ints = NDArray[np.int64]
 NO_LANE = -1
 NEAR = 5.0  # a lane is looked at where a track is this near to the box around it [m]
+COARSE = 16  # rows of a route's table between those that a search for the foot starts at
 JOINT = 0.5  # a lane's line goes on for this beyond its ends: lines that join may leave a gap [m]
 STEEPEST = 1.2  # |d'| at which a track that turns away from a lane is believed to go
 
@@ -166,6 +167,11 @@ class Predictions(NamedTuple):
         """(M,)"""
         return self.obstacles.probability
 
+    @property
+    def covariance(self) -> Floats:
+        """(M, 2, 2) of where they are now [m^2]."""
+        return self.tracks.covariance[self.track]
+
 
 def predict(
     roads: Network,
@@ -180,7 +186,7 @@ def predict(
     known  their relations to lanes, where they are at hand. Raises InputError for tracks that are none (NaN, shapes)"""
     related = relations(roads, tracks, settings) if known is None else known
     soon = np.asarray(times, float)
-    later: Floats = settings.step * np.arange(round(settings.later / settings.step) + 1)
+    later = np.arange(round(settings.later / settings.step) + 1) * np.float64(settings.step)
     every = np.r_[later, soon]
     way, speed = _ways(tracks, every, settings)
     found = list(_hypotheses(roads, related, way.max(1, initial=0.0), settings))
@@ -282,10 +288,10 @@ def _along_lanes(roads: Network, found: list[_Hypothesis], way: Floats, pose: Fl
     start = np.array([(h.d, h.slope, h.back) for h in found])
     for a, told in pieces.items():
         line, which = roads.lines[a], np.array([m for m, _, _ in told])
-        begins, ends = np.array([span for _, *span in told]).T[..., None]
+        begins, ends = np.array([[b, e] for _, b, e in told]).T[..., None]
         piece, k = np.nonzero((way[which] >= begins) & (way[which] < ends))
-        m = which[piece]
-        w, (d0, slope, back) = way[m, k], start[m].T
+        row = which[piece]
+        w, (d0, slope, back) = way[row, k], start[row].T
         s = w - begins[piece, 0]
         on = line.at(np.minimum(s, line.length))
         over = np.maximum(s - line.length, 0.0)
@@ -293,7 +299,7 @@ def _along_lanes(roads: Network, found: list[_Hypothesis], way: Floats, pose: Fl
         d, rate = (d0 + pull * w) * fade, (pull - (d0 + pull * w) / back) * fade
         cos, sin = np.cos(on[:, 2]), np.sin(on[:, 2])
         x, y = on[:, 0] + over * cos - d * sin, on[:, 1] + over * sin + d * cos
-        pose[m, k] = np.stack([x, y, on[:, 2] + np.arctan(rate)], -1)
+        pose[row, k] = np.stack([x, y, on[:, 2] + np.arctan(rate)], -1)
 
 
 def _variance(
@@ -320,7 +326,12 @@ class Along(NamedTuple):
 def along(route: Route, predictions: Predictions) -> Along:
     """Where predictions are on a route."""
     shape = predictions.pose.shape[:2]
-    found, ended = route.line.project(predictions.pose[..., :2].reshape(-1, 2))
+    from planning.reference_kernel import nearest
+
+    points = np.ascontiguousarray(predictions.pose[..., :2].reshape(-1, 2))
+    start = np.empty(len(points))
+    nearest(np.ascontiguousarray(route.line.table[::COARSE]), points, start)
+    found, ended = route.line.project(points, start * COARSE * route.line.step)
     theta = route.line.at(found[:, 0])[:, 2].reshape(shape)
     s, d = found[:, 0].reshape(shape), found[:, 1].reshape(shape)
     return Along(s, d, np.cos(predictions.pose[..., 2] - theta), (ended == FOUND).reshape(shape))

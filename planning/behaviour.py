@@ -5,7 +5,7 @@
     lateral   offsets about the middle of the lane, or past what blocks it (planning.release), or into the lane of the
               route (planning.gaps)
 
-No plan passes a stop point without permission, or the route's end (Scene.stop), nor comes to where it must (Scene.stand).
+No plan passes a stop point without permission, or the route's end: Scene.stop, and Scene.stand after the horizon.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def wanted_speed(
     ]
     if lead is not None:
         surplus = lead.rear - front - manners.gap - manners.headway * lead.speed
-        most.append(speed_before(surplus, state.ds, then=lead.speed, **told))
+        most.append(lead.speed + speed_before(surplus, max(state.ds - lead.speed, 0.0), **told))
     if passes:
         most.append(manners.release.speed)
     return max(min(most), 0.0)

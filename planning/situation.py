@@ -8,7 +8,10 @@ and is on lane l with probability w_l / max(sum w, 1), on no lane with what is l
 its successors, it goes a way w(t) with an acceleration that fades out, and comes back to the lane's middle:
 
     w'(t) = v + a tau (1 - e^(-t / tau)) >= 0,    d(w) = (d0 + (d0' + d0 / xi) w) e^(-w / xi)
-    var w = sigma_s^2 + sigma_v^2 t^2 + q t^3 / 3,    var d = sigma_0^2 e^(-2 w / xi) + sigma_lane^2 (1 - e^(-2 w / xi))
+    var w = sigma_s^2 + g (sigma_v^2 t^2 + q t^3 / 3) + (1 - g) (sigma_v tau (1 - e^(-t / tau)))^2,   g = min(v / v0, 1)
+    var d = sigma_0^2 e^(-2 w / xi) + sigma_lane^2 (1 - e^(-2 w / xi))
+
+g: who stands is expected to stand on, so that parked cars do not grow.
 """
 
 from __future__ import annotations
@@ -41,7 +44,8 @@ class Situation:
 
     heading_std   [rad] of road users against their lane
     least         relations less likely than this share of the likeliest are left out
-    fading        tau, in which an acceleration fades out [s]
+    fading        tau, in which an acceleration fades out, or what who stands seems to move [s]
+    moving        v0, from which on road users move [m/s]
     diffusion     q, of speed [m^2/s^3]
     back          xi, way in which road users come back to the middle of their lane [m]
     lane_std      of road users about it [m]
@@ -53,6 +57,7 @@ class Situation:
     heading_std: float = 0.35
     least: float = 0.05
     fading: float = 1.0
+    moving: float = 1.0
     diffusion: float = 0.1
     back: float = 10.0
     lane_std: float = 0.25
@@ -306,7 +311,9 @@ def _variance(
     tracks: Tracks, track: Ints, along: NDArray[np.bool_], t: Floats, way: Floats, settings: Situation
 ) -> tuple[Floats, Floats]:
     """What time adds to the variances (M, T, 2) ahead and across, and what is left (M, T) of today's across."""
-    grown = tracks.speed_std[track, None] ** 2 * t**2 + settings.diffusion * t**3 / 3
+    moves = np.minimum(np.abs(tracks.speed[track, None]) / settings.moving, 1.0)
+    squared, faded = tracks.speed_std[track, None] ** 2, settings.fading * (1.0 - np.exp(-t / settings.fading))
+    grown = moves * (squared * t**2 + settings.diffusion * t**3 / 3) + (1.0 - moves) * squared * faded**2
     back = np.where(along[:, None], np.exp(-2 * np.abs(way) / settings.back), 1.0)
     walking = (tracks.kind[track] == "pedestrian")[:, None] * (settings.walk_std * t) ** 2
     across = np.where(along[:, None], settings.lane_std**2 * (1 - back), (settings.turn_std * way) ** 2 + walking)

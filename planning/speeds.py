@@ -25,6 +25,6 @@ def speed_ahead(
     return float(np.sqrt(most**2 + 2 * braking * np.maximum(way - speed * lag, 0.0)).min())
 
 
-def speed_before(way: float, speed: float, *, braking: float, lag: float, then: float = 0.0) -> float:
-    """From which one who drives `speed` brakes comfortably to `then` within a way [m, m/s]."""
-    return math.sqrt(then**2 + 2 * braking * max(way - max(speed - then, 0.0) * lag, 0.0))
+def speed_before(way: float, speed: float, *, braking: float, lag: float) -> float:
+    """From which one who drives `speed` brakes comfortably to rest within a way [m, m/s]."""
+    return math.sqrt(2 * braking * max(way - speed * lag, 0.0))

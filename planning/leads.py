@@ -68,11 +68,12 @@ def lead_of(
     chance = np.bincount(predictions.track[on], predictions.probability[on], minlength=len(predictions.tracks.label))
     best: Lead | None = None
     for m in np.flatnonzero(on):
-        label = int(labels[m])
+        label, k = int(labels[m]), int(meets[m].argmax())
         if chance[predictions.track[m]] < (KEPT if label == before else LIKELY) and label != waits_for:
             continue
-        k = int(meets[m].argmax())
         pace = float(speed[m, k] * cos[m, k])
+        if s[m, k] - pace * times[k] < state.s + planner.vehicle.middle:
+            continue  # it comes from behind
         if pace < 0:  # towards us: it is met half-way
             k, pace = len(times) - 1, 0.0
         rear = float(s[m, k] - half.along[m, k] - pace * times[k])

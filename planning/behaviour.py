@@ -100,20 +100,26 @@ def behave(
     line = barrier(route, stop_points, permissions, front)
     beside, centre = lane_beside(route, state)
     around = passing(planner, route, state, predictions, told, stop_points, memory.passing, manners.release)
+    movers = [] if around.going else movers_of(planner, route, state, predictions, told, manners.gaps)
     wanted, gap = around.offset if around.going else 0.0, None
-    if not around.going:
-        movers = movers_of(planner, route, state, predictions, told, manners.gaps)
-        if movers:
-            middle, limit = state.s + vehicle.middle, float(route.limit_at(np.array([state.s]))[0])
-            gap = choose_gap(movers, middle, vehicle.length, limit, memory.gap, manners.gaps)
-            if beside and not gap.open(middle, state.ds, vehicle.length, manners.gaps):
-                wanted = centre
+    if movers:
+        middle, limit = state.s + vehicle.middle, float(route.limit_at(np.array([state.s]))[0])
+        join = min(
+            (float(s) - manners.gaps.stop for s in route.joins if s - manners.gaps.stop > front), default=math.inf
+        )
+        gap = choose_gap(movers, middle, vehicle.length, limit, memory.gap, manners.gaps, way=join - front)
+        if not gap.open(middle, state.ds, vehicle.length, manners.gaps):
+            wanted = centre
+            if join - front > state.ds**2 / (2 * manners.braking):
+                line = min(line, join)
     waits_for = -1 if around.going else around.blocker
-    lead = lead_of(planner, state, predictions, told, wanted, memory.lead, waits_for)
+    joining = [mover.label for mover in movers if mover.joins]
+    lead = lead_of(planner, state, predictions, told, wanted, memory.lead, waits_for, joining)
     if beside and not around.going:
         here = lead_of(planner, state, predictions, told, state.d, memory.lead)
         lead = min((one for one in (lead, here) if one is not None), key=lambda one: one.rear, default=None)
-    lead = behind_gap(lead, gap, state.s + vehicle.middle)
+    if gap is not None and gap.missing(state.s + vehicle.middle, vehicle.length, manners.gaps) >= 0.0:
+        lead = behind_gap(lead, gap)
     speed = wanted_speed(planner, route, state, line, lead, around.going, manners)
     goal, word = choose(planner, state, speed, line, lead, gap, memory, manners, waits_for)
     low, high = span(planner, route, state, around)
@@ -142,9 +148,9 @@ def lane_beside(route: Route, state: FrenetState) -> tuple[bool, float]:
     return False, 0.0
 
 
-def behind_gap(lead: Lead | None, gap: Gap | None, middle: float) -> Lead | None:
-    """The nearer one of the lead and the vehicle ahead of a gap, where one is behind that already."""
-    if gap is None or gap.ahead is None or gap.ahead.s - gap.ahead.half < middle:
+def behind_gap(lead: Lead | None, gap: Gap) -> Lead | None:
+    """The nearer one of the lead and the vehicle ahead of a gap."""
+    if gap.ahead is None:
         return lead
     one = Lead(gap.ahead.label, gap.ahead.s - gap.ahead.half, gap.ahead.speed, 0.0, 0.0)
     return one if lead is None or one.rear < lead.rear else lead

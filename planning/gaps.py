@@ -40,7 +40,7 @@ class Gaps:
     shift, within  faster or slower than the gap [m/s], by what is missing within a time [s]
     hold           [s]
     chance         that a vehicle is there, from which on it counts
-    far            how far ahead a lane that joins is looked at [m]
+    far            how far ahead a lane that joins is looked at; who is in no gap stands `stop` before it [m]
     """
 
     room: float = 2.0
@@ -50,7 +50,8 @@ class Gaps:
     within: float = 3.0
     hold: float = 3.0
     chance: float = 0.3
-    far: float = 100.0
+    far: float = 150.0
+    stop: float = 15.0
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -59,12 +60,13 @@ class Gaps:
 
 
 class Mover(NamedTuple):
-    """A vehicle of the lane: label, s of its middle [m], half its length [m], speed [m/s]."""
+    """A vehicle of the lane: label, s of its middle [m], half its length [m], speed [m/s]; joins: not here yet."""
 
     label: int
     s: float
     half: float
     speed: float
+    joins: bool = False
 
 
 class Gap(NamedTuple):
@@ -82,10 +84,10 @@ class Gap(NamedTuple):
         """In which the own middle may be in a time t; empty where least > largest."""
         low, high = -math.inf, math.inf
         if self.behind is not None:
-            s, half, v = self.behind[1:]
+            _, s, half, v, _ = self.behind
             low = s + v * t + half + settings.room + settings.headway * v + length / 2
         if self.ahead is not None:
-            s, half, v = self.ahead[1:]
+            _, s, half, v, _ = self.ahead
             high = s + v * t - half - settings.room - settings.headway * v - length / 2
         return low, high
 
@@ -109,9 +111,10 @@ class Gap(NamedTuple):
         shift = self.missing(state.s + middle, length, settings)
         ahead, behind = self.ahead, self.behind
         if shift > 0.0 and behind is not None:
-            return Keep(min(speed, behind.speed + min(shift / settings.within, settings.shift)))
+            return Keep(min(speed, behind.speed + min((shift + settings.room) / settings.within, settings.shift)))
         if shift < 0.0 and ahead is not None:
-            return Keep(min(speed, max(ahead.speed - min(-shift / settings.within, settings.shift), 0.0)))
+            slower = min((settings.room - shift) / settings.within, settings.shift)
+            return Keep(min(speed, max(ahead.speed - slower, 0.0)))
         if ahead is None or behind is None:
             return None
         found = merge((ahead.s - ahead.half - middle, ahead.speed), (behind.s + behind.half - middle, behind.speed))
@@ -125,10 +128,13 @@ def choose_gap(
     speed: float,
     before: tuple[int, int],
     settings: Gaps = Gaps(),
+    *,
+    way: float = math.inf,
 ) -> Gap:
     """The gap that is reached soonest; there is always one before the first vehicle and behind the last.
 
-    middle  own [m]; speed  the highest wanted [m/s]; before  labels of the gap taken in the last cycle"""
+    middle  own [m]; speed  the highest wanted [m/s]; before  labels of the gap taken in the last cycle
+    way     within which one must be in it, where one has to catch up with it [m]"""
     order = sorted(movers, key=lambda mover: -mover.s)
     gaps = [Gap(a, b) for a, b in pairwise([None, *order, None])]
 
@@ -140,6 +146,8 @@ def choose_gap(
         faster = settings.shift
         if shift > 0.0 and gap.behind is not None:
             faster = max(min(speed - gap.behind.speed, faster), SLOWEST)
+            if shift / faster * (gap.behind.speed + faster) > way:
+                return math.inf
         return abs(shift) / faster - (settings.hold if gap.labels == before else 0.0)
 
     return min(gaps, key=time)
@@ -173,5 +181,5 @@ def movers_of(
         label = int(predictions.tracks.label[predictions.track[m]])
         chances[label] = chances.get(label, 0.0) + float(predictions.probability[m])
         s = float(places.s[m, late] - predictions.way[m, late])
-        found[label] = Mover(label, s, float(half.along[m, late]), float(predictions.speed[m, 0]))
+        found[label] = Mover(label, s, float(half.along[m, late]), float(predictions.speed[m, 0]), late > 0)
     return [mover for label, mover in found.items() if chances[label] > settings.chance]

@@ -63,7 +63,7 @@ class Situation:
     lane_std: float = 0.25
     turn_std: float = 0.1
     walk_std: float = 0.3
-    later: float = 10.0
+    later: float = 15.0
     step: float = 0.25
 
     def __post_init__(self) -> None:

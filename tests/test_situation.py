@@ -148,7 +148,7 @@ def test_a_fork_is_predicted_into_both_branches() -> None:
 
 def test_beyond_the_last_lane_it_goes_straight_on() -> None:
     found = predict(FORK, tracks([User(140.0, 0.0, 0.0, 10.0)]), TIMES)
-    np.testing.assert_allclose(found.pose[0, -1], [240.0, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(found.pose[0, 40], [240.0, 0.0, 0.0], atol=0.02)
 
 
 def test_off_the_lanes_all_go_straight_and_pedestrians_may_turn() -> None:

@@ -77,7 +77,7 @@ def test_a_chance_constraint_at_its_limit_is_kept_in_simulation() -> None:
 def test_a_place_uncertain_ahead_does_not_count_as_uncertain_to_the_side() -> None:
     """Oncoming traffic in the next lane: where it is along its lane does not matter."""
     body = Obstacles(np.zeros((1, 1, 3)), np.array([[4.6, 1.9]]), np.array([[np.diag([9.0, 0.04])]]), np.ones(1))
-    row = body.table(1e-3, VEHICLE.radius, 5.0)[0, 0]
+    row = body.table(1e-3, VEHICLE.radius, 5.0)[0, :, 0]
     side = 0.95 + VEHICLE.radius + row[9] * 0.2
     way = np.linspace(-20.0, 20.0, 401)
     assert (margins(row, np.stack([way, np.full(401, side + 0.01)], -1), VEHICLE.radius) > 0).all()

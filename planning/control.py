@@ -1,6 +1,6 @@
 """Control along a planned motion, and the vehicle that is controlled.
 
-The vehicle is a kinematic bicycle told at its rear axle, whose drive and steering follow commands with first-order lags:
+The vehicle is a kinematic bicycle told at its rear axle; drive and steering follow commands with first-order lags:
 
     x' = v cos theta,  y' = v sin theta,  theta' = v kappa,  v' = a
     a' = (a_cmd - a) / tau_drive,   kappa' = (kappa_cmd - kappa) / tau_steer
@@ -14,7 +14,7 @@ Along, a state-space controller: of the errors x = (place, speed, acceleration) 
     kappa_cmd = kappa_ff - k1 e - k2 psi      so that  e'' + k2 e' + k1 e = 0  in way, k1 = p1 p2, k2 = -(p1 + p2)
 
 which needs no speed. Both feed forward what lets a lag arrive at the plan's value after a step:
-(r(t + dt) - phi r(t)) / (1 - phi), phi = exp(-dt / tau). [K15], section IV-A: separate controllers, the longitudinal one
+(r(t + dt) - phi r(t)) / (1 - phi), phi = exp(-dt / tau). [K15], section IV-A: two separate controllers, the one along
 in state space.
 """
 

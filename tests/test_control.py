@@ -1,4 +1,4 @@
-"""Control: the poles asked for, in the model and in the vehicle itself; circles, standstill, and numbers that are none."""
+"""Control: the poles asked for, in the model and in the vehicle; circles, standstill, numbers that are none."""
 
 from __future__ import annotations
 

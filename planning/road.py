@@ -8,12 +8,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from models.program import InputError
 from planning.reference import ReferenceLine, from_points
 
 Floats = NDArray[np.float64]
+EDGE = 1.0  # between the offsets of borders along a route [m]
 
 
 class Lane(NamedTuple):
@@ -36,7 +37,7 @@ class Lane(NamedTuple):
     def centre(self) -> Floats:
         """(K, 2) midway between the borders, at equal shares of their lengths."""
         num = max(len(self.left), len(self.right), 3)
-        return (_even(self.left, num) + _even(self.right, num)) / 2
+        return (even(self.left, num) + even(self.right, num)) / 2
 
 
 Lanes = Mapping[int, Lane]
@@ -65,6 +66,34 @@ class Tracks(NamedTuple):
     existence: Floats
 
 
+def no_tracks() -> Tracks:
+    """None of them."""
+    none, pairs = np.zeros(0), np.zeros((0, 2))
+    label, kind = np.zeros(0, np.int64), np.zeros(0, np.str_)
+    return Tracks(label, kind, pairs, np.zeros((0, 2, 2)), none, none, none, none, pairs, none)
+
+
+def check_tracks(tracks: Tracks) -> None:
+    """Raises InputError for wrong shapes, NaN, sizes that are not positive, and probabilities outside [0, 1]."""
+    num = len(tracks.label)
+    shapes = {"kind": (num,), "position": (num, 2), "covariance": (num, 2, 2), "size": (num, 2)}
+    for name, value in tracks._asdict().items():
+        shape = shapes.get(name, (num,))
+        if np.shape(value) != shape:
+            raise InputError(f"tracks: {name} has shape {np.shape(value)}, but must be {shape}")
+        if name in ("label", "kind"):
+            continue
+        bad = np.flatnonzero(~np.isfinite(value).reshape(num, -1).all(1))
+        if len(bad):
+            raise InputError(f"track {tracks.label[bad[0]]}: its {name} is not finite; leave the track out or mend it")
+    for row in np.flatnonzero((tracks.size <= 0).any(1)):
+        raise InputError(
+            f"track {tracks.label[row]}: its size is {tracks.size[row].tolist()}, but must be positive [m]"
+        )
+    for row in np.flatnonzero((tracks.existence < 0) | (tracks.existence > 1)):
+        raise InputError(f"track {tracks.label[row]}: its existence is {tracks.existence[row]}, outside [0, 1]")
+
+
 class StopPoint(NamedTuple):
     """A virtual stopping point of the map ([K15], section IV-A): its line may be passed by permission only.
 
@@ -88,7 +117,11 @@ class Route(NamedTuple):
     lanes     their ids
     start     (L,) arc length at which each begins
     speed     (L,) their limits [m/s]
-    borders   polylines that must not be touched: the outer borders of what may be driven
+    borders   polylines that must not be touched: left and right border of each lane, in turn
+    outer     (left, right) of each lane: the far border of the lane beside it, or None
+    edges     (N, 4) offsets at s = 0, 1, 2, ... m: far border of the lane to the left (its own where there is none),
+              left border, right border, far border of the lane to the right [m]
+    opposite  (N, 2) whether the lanes beside are driven the other way
     """
 
     line: ReferenceLine
@@ -96,6 +129,18 @@ class Route(NamedTuple):
     start: Floats
     speed: Floats
     borders: tuple[Floats, ...]
+    outer: tuple[tuple[Floats | None, Floats | None], ...]
+    edges: Floats
+    opposite: NDArray[np.bool_]
+
+    def edges_at(self, s: ArrayLike) -> Floats:
+        """(*, 4) at arc lengths (*,)."""
+        grid = EDGE * np.arange(len(self.edges))
+        return np.stack([np.interp(np.asarray(s, float), grid, column) for column in self.edges.T], -1)
+
+    def limit_at(self, s: ArrayLike) -> Floats:
+        """Speed limit (*,) at arc lengths (*,) [m/s]."""
+        return self.speed[np.clip(np.searchsorted(self.start, s, "right") - 1, 0, len(self.speed) - 1)]
 
 
 def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
@@ -117,10 +162,42 @@ def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
     begins, _ = line.project([p[0] for p in parts])
     start = np.maximum.accumulate(begins[:, 0])
     borders = tuple(border for a in ids for border in (lanes[a].left, lanes[a].right))
-    return Route(line, tuple(ids), start, np.array([lanes[a].speed for a in ids]), borders)
+    outer = tuple((_far_border(lanes, a, 0), _far_border(lanes, a, 1)) for a in ids)
+    grid = EDGE * np.arange(int(line.length / EDGE) + 1)
+    which = np.clip(np.searchsorted(start, grid, "right") - 1, 0, len(ids) - 1)
+    edges = np.zeros((len(grid), 4))
+    for n, a in enumerate(ids):
+        here = which == n
+        far_left, far_right = outer[n]
+        left, right = lanes[a].left, lanes[a].right
+        for column, border in enumerate(
+            (left if far_left is None else far_left, left, right, right if far_right is None else far_right)
+        ):
+            edges[here, column] = _offsets(line, border, grid[here])
+    opposite = np.array([lanes[a].opposite for a in ids])[which]
+    return Route(line, tuple(ids), start, np.array([lanes[a].speed for a in ids]), borders, outer, edges, opposite)
 
 
-def _even(line: Floats, num: int) -> Floats:
+def _far_border(lanes: Lanes, a: int, side: int) -> Floats | None:
+    """Of the lane beside lane a, to the left (0) or right (1)."""
+    beside = lanes[a].beside[side]
+    if beside is None:
+        return None
+    if beside not in lanes:
+        raise InputError(f"lane {a} has lane {beside} beside it, which the map has not; leave it out or add it")
+    # the left border of a lane to the left is the far one, but its right border where it is driven the other way
+    return lanes[beside].left if (side == 0) != lanes[a].opposite[side] else lanes[beside].right
+
+
+def _offsets(line: ReferenceLine, border: Floats, s: Floats) -> Floats:
+    """Of a border at arc lengths s."""
+    way = float(np.hypot(*np.diff(border, axis=0).T).sum())
+    found, _ = line.project(even(border, max(int(way / EDGE), 1) + 1))
+    order = np.argsort(found[:, 0], kind="stable")
+    return np.interp(s, found[order, 0], found[order, 1])
+
+
+def even(line: Floats, num: int) -> Floats:
     """num points at equal shares of its length."""
     way = np.r_[0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))]
     at = np.linspace(0.0, way[-1], num)

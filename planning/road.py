@@ -83,9 +83,11 @@ def check_tracks(tracks: Tracks) -> None:
             raise InputError(f"tracks: {name} has shape {np.shape(value)}, but must be {shape}")
         if name in ("label", "kind"):
             continue
-        bad = np.flatnonzero(~np.isfinite(value).reshape(num, -1).all(1))
+        bad = np.argwhere(~np.isfinite(value))
         if len(bad):
-            raise InputError(f"track {tracks.label[bad[0]]}: its {name} is not finite; leave the track out or mend it")
+            raise InputError(
+                f"track {tracks.label[bad[0, 0]]}: its {name} is not finite; leave the track out or mend it"
+            )
     for row in np.flatnonzero((tracks.size <= 0).any(1)):
         raise InputError(
             f"track {tracks.label[row]}: its size is {tracks.size[row].tolist()}, but must be positive [m]"

@@ -6,7 +6,9 @@ e ~ N(0, S), they can touch only if e . q / |q| >= |q| - R, so
 
     P(touch) <= Phi(-(|q| - R) / sigma),   sigma^2 = q' S q / |q|^2
 
-and the chance constraint P <= Phi(-z) holds where |q| - R >= z sigma. Without uncertainty it is the distance.
+and the chance constraint P <= Phi(-z) holds where |q| - R >= z sigma. Without uncertainty it is the distance. Any
+other direction bounds P too: along and across the rectangle they keep a place that is uncertain ahead, like that of
+oncoming traffic in the next lane, from counting as uncertain to the side.
 """
 
 from __future__ import annotations
@@ -64,10 +66,13 @@ def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
     qy = left - ops.fmin(ops.fmax(left, -half_width), half_width)
     squared = qx * qx + qy * qy
     spread = qx * qx * along + 2 * qx * qy * mixed + qy * qy * across
-    return (squared - radius * ops.sqrt(squared) - z * ops.sqrt(spread),)
+    root = ops.sqrt(squared)
+    beside = ops.fabs(left) - half_width - radius - z * ops.sqrt(across)
+    beyond = ops.fabs(ahead) - half_length - radius - z * ops.sqrt(along)
+    return (ops.fmax(squared - radius * root - z * ops.sqrt(spread), root * ops.fmax(beside, beyond)),)
 
 
-# |q| (|q| - R - z sigma), positive where a circle at x is clear of a rectangle; covariance in the rectangle's frame
+# |q| times the largest of |q| - R - z sigma and the same along and across the rectangle: positive where a circle at x is clear of a rectangle; covariance in the rectangle's frame
 CLEARANCE = Formula("clearance", _clearance, 2, 11)
 
 

@@ -8,7 +8,10 @@ and is on lane l with probability w_l / max(sum w, 1), on no lane with what is l
 its successors, it goes a way w(t) with an acceleration that fades out, and comes back to the lane's middle:
 
     w'(t) = v + a tau (1 - e^(-t / tau)) >= 0,    d(w) = (d0 + (d0' + d0 / xi) w) e^(-w / xi)
-    var w = sigma_s^2 + sigma_v^2 t^2 + q t^3 / 3,    var d = sigma_0^2 e^(-2 w / xi) + sigma_lane^2 (1 - e^(-2 w / xi))
+    var w = sigma_s^2 + g (sigma_v^2 t^2 + q t^3 / 3) + (1 - g) (sigma_v tau (1 - e^(-t / tau)))^2,   g = min(v / v0, 1)
+    var d = sigma_0^2 e^(-2 w / xi) + sigma_lane^2 (1 - e^(-2 w / xi))
+
+g: who stands is expected to stand on, so that parked cars do not grow.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from planning.shapes import Obstacles
 Ints = NDArray[np.int64]
 NO_LANE = -1
 NEAR = 5.0  # a lane is looked at where a track is this near to the box around it [m]
+COARSE = 16  # rows of a route's table between those that a search for the foot starts at
 JOINT = 0.5  # a lane's line goes on for this beyond its ends: lines that join may leave a gap [m]
 STEEPEST = 1.2  # |d'| at which a track that turns away from a lane is believed to go
 
@@ -40,7 +44,8 @@ class Situation:
 
     heading_std   [rad] of road users against their lane
     least         relations less likely than this share of the likeliest are left out
-    fading        tau, in which an acceleration fades out [s]
+    fading        tau, in which an acceleration fades out, or what who stands seems to move [s]
+    moving        v0, from which on road users move [m/s]
     diffusion     q, of speed [m^2/s^3]
     back          xi, way in which road users come back to the middle of their lane [m]
     lane_std      of road users about it [m]
@@ -52,6 +57,7 @@ class Situation:
     heading_std: float = 0.35
     least: float = 0.05
     fading: float = 1.0
+    moving: float = 1.0
     diffusion: float = 0.1
     back: float = 10.0
     lane_std: float = 0.25
@@ -166,6 +172,11 @@ class Predictions(NamedTuple):
         """(M,)"""
         return self.obstacles.probability
 
+    @property
+    def covariance(self) -> Floats:
+        """(M, 2, 2) of where they are now [m^2]."""
+        return self.tracks.covariance[self.track]
+
 
 def predict(
     roads: Network,
@@ -180,7 +191,7 @@ def predict(
     known  their relations to lanes, where they are at hand. Raises InputError for tracks that are none (NaN, shapes)"""
     related = relations(roads, tracks, settings) if known is None else known
     soon = np.asarray(times, float)
-    later: Floats = settings.step * np.arange(round(settings.later / settings.step) + 1)
+    later = np.arange(round(settings.later / settings.step) + 1) * np.float64(settings.step)
     every = np.r_[later, soon]
     way, speed = _ways(tracks, every, settings)
     found = list(_hypotheses(roads, related, way.max(1, initial=0.0), settings))
@@ -282,10 +293,10 @@ def _along_lanes(roads: Network, found: list[_Hypothesis], way: Floats, pose: Fl
     start = np.array([(h.d, h.slope, h.back) for h in found])
     for a, told in pieces.items():
         line, which = roads.lines[a], np.array([m for m, _, _ in told])
-        begins, ends = np.array([span for _, *span in told]).T[..., None]
+        begins, ends = np.array([[b, e] for _, b, e in told]).T[..., None]
         piece, k = np.nonzero((way[which] >= begins) & (way[which] < ends))
-        m = which[piece]
-        w, (d0, slope, back) = way[m, k], start[m].T
+        row = which[piece]
+        w, (d0, slope, back) = way[row, k], start[row].T
         s = w - begins[piece, 0]
         on = line.at(np.minimum(s, line.length))
         over = np.maximum(s - line.length, 0.0)
@@ -293,14 +304,16 @@ def _along_lanes(roads: Network, found: list[_Hypothesis], way: Floats, pose: Fl
         d, rate = (d0 + pull * w) * fade, (pull - (d0 + pull * w) / back) * fade
         cos, sin = np.cos(on[:, 2]), np.sin(on[:, 2])
         x, y = on[:, 0] + over * cos - d * sin, on[:, 1] + over * sin + d * cos
-        pose[m, k] = np.stack([x, y, on[:, 2] + np.arctan(rate)], -1)
+        pose[row, k] = np.stack([x, y, on[:, 2] + np.arctan(rate)], -1)
 
 
 def _variance(
     tracks: Tracks, track: Ints, along: NDArray[np.bool_], t: Floats, way: Floats, settings: Situation
 ) -> tuple[Floats, Floats]:
     """What time adds to the variances (M, T, 2) ahead and across, and what is left (M, T) of today's across."""
-    grown = tracks.speed_std[track, None] ** 2 * t**2 + settings.diffusion * t**3 / 3
+    moves = np.minimum(np.abs(tracks.speed[track, None]) / settings.moving, 1.0)
+    squared, faded = tracks.speed_std[track, None] ** 2, settings.fading * (1.0 - np.exp(-t / settings.fading))
+    grown = moves * (squared * t**2 + settings.diffusion * t**3 / 3) + (1.0 - moves) * squared * faded**2
     back = np.where(along[:, None], np.exp(-2 * np.abs(way) / settings.back), 1.0)
     walking = (tracks.kind[track] == "pedestrian")[:, None] * (settings.walk_std * t) ** 2
     across = np.where(along[:, None], settings.lane_std**2 * (1 - back), (settings.turn_std * way) ** 2 + walking)
@@ -320,7 +333,12 @@ class Along(NamedTuple):
 def along(route: Route, predictions: Predictions) -> Along:
     """Where predictions are on a route."""
     shape = predictions.pose.shape[:2]
-    found, ended = route.line.project(predictions.pose[..., :2].reshape(-1, 2))
+    from planning.reference_kernel import nearest
+
+    points = np.ascontiguousarray(predictions.pose[..., :2].reshape(-1, 2))
+    start = np.empty(len(points))
+    nearest(np.ascontiguousarray(route.line.table[::COARSE]), points, start)
+    found, ended = route.line.project(points, start * COARSE * route.line.step)
     theta = route.line.at(found[:, 0])[:, 2].reshape(shape)
     s, d = found[:, 0].reshape(shape), found[:, 1].reshape(shape)
     return Along(s, d, np.cos(predictions.pose[..., 2] - theta), (ended == FOUND).reshape(shape))

@@ -74,6 +74,18 @@ def test_a_chance_constraint_at_its_limit_is_kept_in_simulation() -> None:
                 assert rate > 0.02, "a straight side is met about as often as allowed"
 
 
+def test_a_place_uncertain_ahead_does_not_count_as_uncertain_to_the_side() -> None:
+    """Oncoming traffic in the next lane: where it is along its lane does not matter."""
+    body = Obstacles(np.zeros((1, 1, 3)), np.array([[4.6, 1.9]]), np.array([[np.diag([9.0, 0.04])]]), np.ones(1))
+    row = body.table(1e-3, VEHICLE.radius, 5.0)[0, 0]
+    side = 0.95 + VEHICLE.radius + row[9] * 0.2
+    way = np.linspace(-20.0, 20.0, 401)
+    assert (margins(row, np.stack([way, np.full(401, side + 0.01)], -1), VEHICLE.radius) > 0).all()
+    assert margins(row, np.array([[0.0, side - 0.01]]), VEHICLE.radius) < 0
+    ahead = 2.3 + VEHICLE.radius + row[9] * 3.0
+    assert margins(row, np.array([[ahead + 0.01, 0.0], [ahead - 0.01, 0.0]]), VEHICLE.radius).tolist()[0] > 0
+
+
 def test_unlikely_objects_get_a_larger_chance_each_and_the_unlikeliest_none() -> None:
     same = Obstacles(
         np.zeros((3, 1, 3)), np.ones((3, 2)), np.full((3, 1, 2, 2), np.eye(2)), np.array([1.0, 0.1, 0.009])

@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -156,7 +157,7 @@ def drive(
         plans.append(following)
         made = following
         poses = [Pose(*row) for row in made.trajectory(np.arange(0.0, loop.cycle + 1e-9, loop.control.step))]
-        for k, (wanted, after) in enumerate(zip(poses[:-1], poses[1:], strict=True), start=1):
+        for k, (wanted, after) in enumerate(pairwise(poses), start=1):
             told = command(loop.control, planner.able, ego, wanted, after)
             driven.append((ego, wanted, told))
             ego = moved(loop.lags, ego, told, loop.control.step)
@@ -234,14 +235,14 @@ def _log(
             if pose is not None:
                 others[k, n] = pose[:5]
     now, ms, tier, clear, cost, apart, stop, aim, words, stated = zip(*cycles, strict=True)
-    horizon = np.arange(planner.num_steps + 1) * planner.step
+    horizon = planner.step * np.arange(planner.num_steps + 1, dtype=np.float64)
     ego, wanted, told = (np.array(column, float) for column in zip(*driven, strict=True))
     return Log(
-        time=loop.control.step * np.arange(len(driven)),
+        time=loop.control.step * np.arange(len(driven), dtype=np.float64),
         ego=ego,
         wanted=wanted,
         command=told,
-        looked=loop.world * np.arange(len(looks)),
+        looked=loop.world * np.arange(len(looks), dtype=np.float64),
         others=others,
         cycle=np.array(now),
         ms=np.array(ms),

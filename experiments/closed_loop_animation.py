@@ -13,7 +13,7 @@ from experiments.closed_loop_figures import BAD, GOOD, INK, KERB, OTHER, PLAN, R
 from experiments.tracking_animation import scale
 from inference.progress import Progress
 
-INCHES = (7.2, 4.4)
+INCHES = (7.2, 3.56)
 PER_SECOND = 10
 CANDIDATES = 120  # drawn at most
 GROUPS = {  # colours that stay the same over the drive
@@ -45,9 +45,9 @@ class Animation:
 
         shown = np.unique(np.linspace(0, len(self.drive.plans) - 1, self.frames).round().astype(int))
         figure = Figure(figsize=INCHES, dpi=min(dpi, 100.0))
-        axes = figure.add_axes((0.004, 0.09, 0.992, 0.9))
+        axes = figure.add_axes((0.004, 0.13, 0.992, 0.866))
         writer = PillowWriter(fps=PER_SECOND)
-        figure.legend(handles=_handles(), loc="lower center", ncols=8, frameon=False, fontsize=7.5, columnspacing=1.2)
+        figure.legend(handles=_handles(), loc="lower center", ncols=4, frameon=False, fontsize=8, columnspacing=1.2)
         with writer.saving(figure, str(file), figure.dpi), Progress("drawing", len(shown)) as bar:
             for number in shown:
                 axes.clear()
@@ -58,9 +58,8 @@ class Animation:
     def draw(self, axes: Any, number: int) -> None:
         """A cycle, with its time, speed and tier."""
         log, fan = self.drive.log, fan_of(self.drive, number, CANDIDATES)
-        draw_cycle(axes, self.drive, number, fan, {reason: _colour(reason) for reason in fan.count})
+        draw_cycle(axes, self.drive, number, fan, {reason: _colour(reason) for reason in fan.numbers})
         axes.set(xticks=[], yticks=[])
-        axes.set_adjustable("datalim")
         speed = log.planned[number, 0, 3]
         told = f"{log.cycle[number]:.1f} s   {speed:.1f} m/s   {log.tier[number]}"
         axes.text(0.015, 0.975, told, transform=axes.transAxes, va="top", fontsize=9, color=INK, zorder=9)

@@ -22,14 +22,15 @@ from planning.planner import COMFORT, EMERGENCY, RELAXED, Candidates, plan
 Floats = NDArray[np.float64]
 INK, FAINT, KERB, ROUTE = "#1d2430", "#c9ced6", "#5b3f8c", "#8a8f98"
 PLAN, EGO, OTHER, PREDICTED = "#0b5fa5", "#0b5fa5", "#d1702c", "#d1702c"
-GOOD = "#3b8a5a"
+GOOD, LINE = "#3b8a5a", "#b3261e"
 BAD = ("#c2459e", "#b3261e", "#e0a100", "#7b3f9e", "#8a5a2b", "#00868b")  # the reasons met most, then the rest
 REST = "#9aa1ab"
 TIERS = {COMFORT: "none", RELAXED: "#fdf0d5", EMERGENCY: "#fbdada"}
 SHOWN = 400  # candidates at most
 EVERY = 10  # steps between ellipses of a prediction
 LEAST = 0.02  # probability of predictions that are drawn
-VIEW = (30.0, 62.0, 24.0)  # metres behind, ahead and to the sides that are seen
+VIEW = np.array([42.0, 18.0])  # half of what is seen [m]
+BEFORE = 0.4  # share of it that the vehicle is before its middle
 
 
 class Fan(NamedTuple):
@@ -37,7 +38,7 @@ class Fan(NamedTuple):
 
     path: Floats
     reason: NDArray[np.int64]
-    count: dict[int, int]
+    numbers: dict[int, int]
 
 
 def figures(drive: Drive) -> dict[str, Figure]:
@@ -53,14 +54,14 @@ def busiest(drive: Drive) -> int:
 def cycle_figure(drive: Drive, number: int) -> Figure:
     """One cycle from above."""
     fan = fan_of(drive, number, SHOWN)
-    figure = Figure(figsize=(10.0, 6.6), layout="constrained")
+    figure = Figure(figsize=(10.0, 5.9), layout="constrained")
     axes = figure.subplots()
     colours = colours_of(fan)
     draw_cycle(axes, drive, number, fan, colours)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     made = drive.plans[number]
     axes.set_title(
-        f"{drive.scene.name}, {drive.log.cycle[number]:.2f} s: {made.tier}, {sum(fan.count.values())} candidates",
+        f"{drive.scene.name}, {drive.log.cycle[number]:.2f} s: {made.tier}, {sum(fan.numbers.values())} candidates",
         loc="left",
         fontsize=11,
     )
@@ -70,9 +71,9 @@ def cycle_figure(drive: Drive, number: int) -> Figure:
         Line2D([], [], color=ROUTE, lw=1.0, ls="--", label="reference line"),
         Patch(facecolor=EGO, label="vehicle"),
     ]
-    if len(made_obstacles := drive.given[number].obstacles.pose):
+    if drive.scene.actors:
         handles.append(Patch(facecolor=OTHER, label="road users"))
-        handles.append(Patch(facecolor=PREDICTED, alpha=0.3, label=f"{made_obstacles.__len__()} predictions, 90 %"))
+        handles.append(Patch(facecolor=PREDICTED, alpha=0.3, label="where they will be, 90 %"))
     handles += candidate_handles(fan, colours)
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
@@ -108,16 +109,16 @@ def _paths(drive: Drive, number: int, made: Candidates, shown: NDArray[np.int64]
 
 def colours_of(fan: Fan) -> dict[int, str]:
     """{reason: colour}; the rarest share one."""
-    bad = sorted((r for r in fan.count if r > 0), key=lambda reason: -fan.count[reason])
+    bad = sorted((r for r in fan.numbers if r > 0), key=lambda reason: -fan.numbers[reason])
     return {0: GOOD} | {reason: BAD[k] if k < len(BAD) else REST for k, reason in enumerate(bad)}
 
 
 def candidate_handles(fan: Fan, colours: dict[int, str]) -> list[Line2D]:
     """For the legend, with numbers."""
-    words = {0: "good"} | {r: REASONS[r] for r in fan.count if r > 0}
-    order = sorted(fan.count, key=lambda reason: (reason != 0, -fan.count[reason]))
+    words = {0: "good"} | {r: REASONS[r] for r in fan.numbers if r > 0}
+    order = sorted(fan.numbers, key=lambda reason: (reason != 0, -fan.numbers[reason]))
     return [
-        Line2D([], [], color=colours.get(r, REST), lw=1.4, label=f"{words.get(r, 'not judged')}: {fan.count[r]}")
+        Line2D([], [], color=colours.get(r, REST), lw=1.4, label=f"{words.get(r, 'not judged')}: {fan.numbers[r]}")
         for r in order
     ]
 
@@ -142,24 +143,21 @@ def draw_cycle(axes: Axes, drive: Drive, number: int, fan: Fan, colours: dict[in
     for n, actor in enumerate(drive.scene.actors):
         pose = log.others[look, n]
         if np.isfinite(pose[0]):
-            axes.add_collection(PolyCollection(outlines(pose[None, :3], actor.size), facecolors=OTHER, zorder=4))
-    middle = ego[:3] + [*(vehicle.middle * ahead), 0.0]
+            axes.add_collection(PolyCollection(list(outlines(pose[None, :3], actor.size)), facecolors=OTHER, zorder=4))
+    middle = ego[:3] + vehicle.middle * np.r_[ahead, 0.0]
     axes.add_collection(
-        PolyCollection(outlines(middle[None], (vehicle.length, vehicle.width)), facecolors=EGO, zorder=5)
+        PolyCollection(list(outlines(middle[None], (vehicle.length, vehicle.width))), facecolors=EGO, zorder=5)
     )
     axes.plot(*log.planned[number, :, :2].T, color=PLAN, lw=2.6, zorder=6)
     if math.isfinite(given.stop) and given.stop < given.line.length - 1e-6:
         across = given.line.place([given.stop, given.stop], [-2.0, 2.0])
-        axes.plot(*across.T, color="#b3261e", lw=2.2, zorder=3)
+        axes.plot(*across.T, color=LINE, lw=2.2, zorder=3)
 
 
 def _view(axes: Axes, place: Floats, ahead: Floats) -> None:
     """Around a place, farther ahead of it than behind."""
-    behind, before, beside = VIEW
-    middle = place + ahead * (before - behind) / 2
-    long = (before + behind) / 2
-    half = np.maximum(np.abs(ahead) * long, beside)
-    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+    low, high = place + BEFORE * ahead * VIEW - VIEW, place + BEFORE * ahead * VIEW + VIEW
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal")
 
 
@@ -205,16 +203,20 @@ def time_series(drive: Drive) -> Figure:
     across.set(ylabel="acceleration\nacross [m/s²]")
     aside.plot(t, offset, color=EGO, label="driven")
     aside.step(log.cycle, [given.wanted for given in drive.given], where="post", color=OTHER, lw=1.0, label="wanted")
-    aside.set(ylabel="offset from the\nreference line [m]")
+    low, high = aside.get_ylim()
+    aside.set(ylabel="offset from the\nreference line [m]", ylim=(min(low, -0.5), max(high, 0.5)))
     gap, stop = _free_way(drive, s)
-    free.plot(log.looked, gap, color=OTHER, label="gap to the road user ahead")
-    free.plot(t, stop, color="#b3261e", label="way to the stop point")
-    if not np.isfinite(np.r_[gap, stop]).any():
+    told = ((log.looked, gap, OTHER, "gap to the road user ahead"), (t, stop, LINE, "way to the stop point"))
+    for at, way, colour, name in told:
+        if np.isfinite(way).any():
+            free.plot(at, way, color=colour, label=name)
+    if not free.lines:
         free.text(0.5, 0.5, "nothing ahead", transform=free.transAxes, ha="center", va="center", color=ROUTE)
     free.set(ylabel="free way [m]", xlabel="time [s]")
     free.set_ylim(bottom=-1.0)
     for axes in (speed, along, across, aside, free):
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
+        if axes.lines:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
     tiers = [Patch(facecolor=TIERS[tier], label=f"{tier} plan") for tier in (RELAXED, EMERGENCY) if tier in log.tier]
     if tiers:
         figure.legend(handles=tiers, loc="outside lower center", ncols=2, frameon=False, fontsize=9)

@@ -10,6 +10,7 @@ is the same for use from Python, where nothing is stored.
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -70,7 +71,8 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
     failures: dict[str, Exception] = {}
 
     def collect(kind: str) -> dict[str, Any]:
-        began, out = time.perf_counter(), {}
+        began = time.perf_counter()
+        out: dict[str, Any] = {}
         for function in parts[kind]:
             name = getattr(function, "func", function).__name__
             try:
@@ -140,10 +142,10 @@ def report(
     from experiments.report import details, failure_boxes, page, scores_table, table
 
     stated = [(f"{at:.2f}", why) for at, why in zip(found.log.cycle, found.log.stated, strict=True) if why]
-    thought = [(0.0, found.log.words[0])]
+    thought = [("0.00", found.log.words[0])]
     for at, words in zip(found.log.cycle[1:], found.log.words[1:], strict=True):
-        if words != thought[-1][1]:
-            thought.append((float(at), words))
+        if re.sub(r"[\d.]+", "", words) != re.sub(r"[\d.]+", "", thought[-1][1]):
+            thought.append((f"{at:.2f}", words))
     turned_down: dict[str, int] = {}
     for made in found.plans:
         for reason, count in made.rejected.items():
@@ -160,7 +162,7 @@ def report(
         "<h2>Candidates turned down</h2>",
         table(("reason", "candidates"), sorted(turned_down.items(), key=lambda item: -item[1])),
         "<h2>What was thought</h2>",
-        table(("from [s]", "thought"), [(f"{at:.2f}", words) for at, words in thought]),
+        table(("from [s]", "thought"), thought),
         "<h2>Time</h2>",
         table(("stage", "seconds"), list(manifest["seconds"].items())),
         "<h2>Settings and provenance</h2>",

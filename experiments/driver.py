@@ -1,4 +1,4 @@
-"""Who drives by the rules: situation analysis, decisions and behaviour, one after the other, with what they remember."""
+"""Who drives by the rules: situation analysis, decisions and behaviour in turn, with what they remember."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """Drives on made roads, each about one thing that a planner must get right.
 
-    follow       behind a car that brakes, drives on, and keeps its speed in the end
-    stop_line    a light that turns green, then one that does not
-    parked_car   half on the lane; the lane beside is driven the other way, and somebody may come along it
-    cut_in       a car changes into the own lane, shortly ahead
-    merge        from a ramp between cars that react
-    roundabout   entered once those on the ring have passed
-    box          walls ahead and beside, nearer than an ordinary stop: an emergency stop comes to rest in time
+follow       behind a car that brakes, drives on, and keeps its speed in the end
+stop_line    a light that turns green, then one that does not
+parked_car   half on the lane; the lane beside is driven the other way, and somebody may come along it
+cut_in       a car changes into the own lane, shortly ahead
+merge        from a ramp between cars that react
+roundabout   entered once those on the ring have passed
+box          walls ahead and beside, nearer than an ordinary stop: an emergency stop comes to rest in time
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.scenarios.driving import Actor, DriveScene, Noise, Reacting, Scripted
-from planning.frenet import FrenetState, Pose, to_pose
+from planning.frenet import FrenetState, to_pose
 from planning.reference import ReferenceLine, from_curvature, from_points
 from planning.road import Lane, Lanes, StopPoint
 
 Floats = NDArray[np.float64]
 WIDTH = 3.5  # of lanes [m]
+RING = 4.5  # of those of a roundabout, where a car needs more
 LIMIT = 50 / 3.6  # of speed in town [m/s]
 
 
@@ -88,7 +89,7 @@ def merge(*, gap: float = 45.0, duration: float = 25.0) -> DriveScene:
 def roundabout(*, duration: float = 40.0) -> DriveScene:
     """Straight across a roundabout; two cars on the ring pass the entry, one after the other, before it is free."""
     radius, turn = 14.0, 12.0
-    s = np.arange(0.0, 171.0, 1.0)
+    s = np.arange(0.0, 251.0, 1.0)
     line = from_curvature(s, _ring_curvature(s, radius, turn))
     middle = line.at(100.0)
     centre = middle[:2] + radius * np.array([-math.sin(middle[2]), math.cos(middle[2])])
@@ -97,22 +98,22 @@ def roundabout(*, duration: float = 40.0) -> DriveScene:
     before = _arc(centre, radius, angles[1] - 2 * math.pi, angles[0])
     whole = _arc(centre, radius, angles[0] - 1.5 * math.pi, angles[0] + 1.2 * math.pi)
     lanes = {
-        1: _lane(line, 0.0, entry, 0.0, successors=(2,)),
-        2: _lane(line, entry, leave, 0.0, successors=(3, 4)),
-        3: _lane(line, leave, line.length, 0.0),
-        4: _lane(before, 0.0, before.length, 0.0, successors=(2,)),
+        1: _lane(line, 0.0, entry, 0.0, successors=(2,), width=RING),
+        2: _lane(line, entry, leave, 0.0, successors=(3, 4), width=RING),
+        3: _lane(line, leave, line.length, 0.0, width=RING),
+        4: _lane(before, 0.0, before.length, 0.0, successors=(2,), width=RING),
     }
     reach = np.arange(before.length - 16.0, before.length, 1.0)
     zone = np.concatenate([before.place(reach, np.full(16, 1.5)), before.place(reach[::-1], np.full(16, -1.5))])
     stop = StopPoint("ring", "yield", 64.0, 84.0, zone)
     ring = tuple(Scripted(whole, at, ((0.0, 5.5),)) for at in (22.0, 8.0))
-    inner = _arc(centre, radius - WIDTH / 2, 0.0, 2 * math.pi - 0.01)
+    inner = _arc(centre, radius - RING / 2, 0.0, 2 * math.pi - 0.01)
     kerbs = (inner.table[:, :2],)
     ego = to_pose(line, FrenetState(5.0, 9.0, 0.0, 0.0))
     return DriveScene("roundabout", lanes, (1, 2, 3), (stop,), {}, ring, kerbs, ego, duration)
 
 
-def box(*, distance: float = 11.0, duration: float = 8.0) -> DriveScene:
+def box(*, distance: float = 10.05, duration: float = 8.0) -> DriveScene:
     """Walls to both sides, and one ahead, `distance` metres before the front."""
     road = _road(200.0, bend=0.0)
     front = 20.0 + 3.85 + distance
@@ -160,10 +161,12 @@ def _beside(line: ReferenceLine, d: float, until: float = math.inf) -> Floats:
     return line.place(s, np.full(len(s), d))
 
 
-def _lane(line: ReferenceLine, start: float, end: float, d: float, *, successors: tuple[int, ...] = ()) -> Lane:
-    """Of a line, at an offset."""
+def _lane(
+    line: ReferenceLine, start: float, end: float, d: float, *, successors: tuple[int, ...] = (), width: float = WIDTH
+) -> Lane:
+    """Along a line, its middle at an offset."""
     s = np.linspace(start, end, max(round(end - start), 3))
-    left, right = (line.place(s, np.full(len(s), d + side * WIDTH / 2)) for side in (1, -1))
+    left, right = (line.place(s, np.full(len(s), d + side * width / 2)) for side in (1, -1))
     return Lane(left, right, successors, speed=LIMIT)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -73,7 +74,11 @@ class Scripted:
         ahead = v * (1.0 - kappa * d)
         turned = math.atan2(dd, ahead) if ahead > 0.0 else 0.0
         return Pose(
-            x - d * math.sin(theta), y + d * math.cos(theta), theta + turned, math.hypot(ahead, dd), a * math.cos(turned)
+            x - d * math.sin(theta),
+            y + d * math.cos(theta),
+            theta + turned,
+            math.hypot(ahead, dd),
+            a * math.cos(turned),
         )
 
     def _along(self, time: float) -> tuple[float, float, float]:
@@ -200,7 +205,7 @@ class DriveScene(NamedTuple):
     ego: Pose
     duration: float
     noise: Noise = Noise()
-    info: Mapping[str, Any] = {}  # noqa: RUF012  (never written)
+    info: Mapping[str, Any] = MappingProxyType({})
 
     def lights_at(self, time: float) -> dict[str, str]:
         """{name of a stop point: state of its light}"""

@@ -21,6 +21,7 @@ from models.program import InputError
 from planning.candidates import Goal, Keep, Reach, follow, stop
 from planning.decision import PAST, Permissions
 from planning.frenet import FrenetState, to_pose
+from planning.gaps import Gap, Gaps, choose_gap, movers_of
 from planning.leads import Lead, lead_of
 from planning.planner import Planner, Scene
 from planning.release import LEFT, RIGHT, Passing, Release, passing
@@ -61,19 +62,22 @@ class Manners:
     num_offsets: int = 5
     spare: float = 0.2
     release: Release = field(default_factory=Release)
+    gaps: Gaps = field(default_factory=Gaps)
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
-            if name != "release" and not 0 < getattr(self, name) < math.inf:
+            if name not in ("release", "gaps") and not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"manners: {name} is {getattr(self, name)}, but must be positive and finite")
 
 
 class Memory(NamedTuple):
-    """What the behavioural layer remembers: the goal's word, the lead (a label, or -1), and passing."""
+    """What the behavioural layer remembers: the goal's word, the lead (a label, or -1), passing, and the gap (labels
+    of the vehicles ahead and behind, or -1)."""
 
     goal: str = KEEP
     lead: int = -1
     passing: Passing = Passing()
+    gap: tuple[int, int] = (-1, -1)
 
 
 def behave(
@@ -92,28 +96,64 @@ def behave(
 
     state   on route.line; places  of the predictions along the route, where they are at hand"""
     told = along(route, predictions) if places is None else places
-    front = state.s + planner.vehicle.front
+    vehicle, front = planner.vehicle, state.s + planner.vehicle.front
     line = barrier(route, stop_points, permissions, front)
+    beside, centre = lane_beside(route, state)
     around = passing(planner, route, state, predictions, told, stop_points, memory.passing, manners.release)
-    wanted = around.offset if around.going else 0.0
+    movers = [] if around.going else movers_of(planner, route, state, predictions, told, manners.gaps)
+    wanted, gap = around.offset if around.going else 0.0, None
+    if movers:
+        middle, limit = state.s + vehicle.middle, float(route.limit_at(np.array([state.s]))[0])
+        join = min(
+            (float(s) - manners.gaps.stop for s in route.joins if s - manners.gaps.stop > front), default=math.inf
+        )
+        gap = choose_gap(movers, middle, vehicle.length, limit, memory.gap, manners.gaps, way=join - front)
+        if not gap.open(middle, state.ds, vehicle.length, manners.gaps):
+            wanted = centre
+            if join - front > state.ds**2 / (2 * manners.braking):
+                line = min(line, join)
     waits_for = -1 if around.going else around.blocker
-    lead = lead_of(planner, state, predictions, told, wanted, memory.lead, waits_for)
+    joining = [mover.label for mover in movers if mover.joins]
+    lead = lead_of(planner, state, predictions, told, wanted, memory.lead, waits_for, joining)
+    if beside and not around.going:
+        here = lead_of(planner, state, predictions, told, state.d, memory.lead)
+        lead = min((one for one in (lead, here) if one is not None), key=lambda one: one.rear, default=None)
+    if gap is not None and gap.missing(state.s + vehicle.middle, vehicle.length, manners.gaps) >= 0.0:
+        lead = behind_gap(lead, gap)
     speed = wanted_speed(planner, route, state, line, lead, around.going, manners)
-    goal, word = choose(planner, state, speed, line, lead, memory, manners, waits_for)
+    goal, word = choose(planner, state, speed, line, lead, gap, memory, manners, waits_for)
     low, high = span(planner, route, state, around)
-    stand = line if lead is None else min(line, lead.stands(planner))
+    wanted = min(max(wanted, low), high)
     scene = Scene(
         route.line,
         state,
         goal,
-        offsets_about(min(max(wanted, low), high), low, high, manners),
-        min(max(wanted, low), high),
+        offsets_about(wanted, low, high, manners),
+        wanted,
         borders(planner, route, state, around),
         predictions.obstacles,
-        max(line, front) if line < math.inf else line,
-        stand,
+        max(line, front),
+        line if lead is None else min(line, lead.stands(planner)),
     )
-    return scene, Memory(word, -1 if lead is None else lead.label, around)
+    return scene, Memory(word, -1 if lead is None else lead.label, around, (-1, -1) if gap is None else gap.labels)
+
+
+def lane_beside(route: Route, state: FrenetState) -> tuple[bool, float]:
+    """Whether the vehicle is on a lane beside the route's, and the offset of that lane's middle [m]."""
+    far_left, left, right, far_right = map(float, route.edges_at(np.array([state.s]))[0])
+    if state.d > left:
+        return True, (far_left + left) / 2 if far_left > left else left
+    if state.d < right:
+        return True, (far_right + right) / 2 if far_right < right else right
+    return False, 0.0
+
+
+def behind_gap(lead: Lead | None, gap: Gap) -> Lead | None:
+    """The nearer one of the lead and the vehicle ahead of a gap."""
+    if gap.ahead is None:
+        return lead
+    one = Lead(gap.ahead.label, gap.ahead.s - gap.ahead.half, gap.ahead.speed, 0.0, 0.0)
+    return one if lead is None or one.rear < lead.rear else lead
 
 
 def barrier(route: Route, stop_points: Sequence[StopPoint], permissions: Permissions, front: float) -> float:
@@ -149,6 +189,7 @@ def choose(
     speed: float,
     line: float,
     lead: Lead | None,
+    gap: Gap | None,
     memory: Memory,
     manners: Manners,
     waits_for: int,
@@ -160,16 +201,17 @@ def choose(
     if line - front <= slack * braking_way(state.ds, manners):
         found.append((line, _reachable(stop(line - manners.before, vehicle.front), state), STOP))
     if lead is not None:
-        gap = manners.room if lead.label == waits_for else manners.gap
-        target = follow(lead.rear, lead.speed, lead.acceleration, vehicle.front, gap=gap, headway=manners.headway)
+        room = manners.room if lead.label == waits_for else manners.gap
+        target = follow(lead.rear, lead.speed, lead.acceleration, vehicle.front, gap=room, headway=manners.headway)
         slack = manners.hysteresis if (memory.goal, memory.lead) == (FOLLOW, lead.label) else 1.0
         slower = lead.speed <= speed + slack - 0.5
         if slower and target.place - state.s <= slack * braking_way(max(state.ds - lead.speed, 0.0), manners):
             found.append((target.place + vehicle.front, _reachable(target, state), FOLLOW))
-    if not found:
-        return Keep(speed), KEEP
-    _, goal, word = min(found, key=lambda told: told[0])
-    return goal, word
+    if found:
+        _, goal, word = min(found, key=lambda told: told[0])
+        return goal, word
+    between = None if gap is None else gap.goal(state, vehicle.middle, vehicle.length, speed, manners.gaps)
+    return (Keep(speed), KEEP) if between is None else (between, MERGE)
 
 
 def braking_way(speed: float, manners: Manners) -> float:

@@ -6,6 +6,7 @@ crosses it does not lead. One that reaches the path in t is told as if it drove 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -51,8 +52,10 @@ def lead_of(
     offset: float,
     before: int = -1,
     waits_for: int = -1,
+    skip: Collection[int] = (),
 ) -> Lead | None:
-    """On the path at `offset`; `before` is the label of the last lead, waits_for one that leads in any case."""
+    """On the path at `offset`; `before` is the label of the last lead, waits_for one that leads in any case, skip those
+    that do not."""
     if not len(predictions.track):
         return None
     soon = predictions.times <= SOON
@@ -64,15 +67,16 @@ def lead_of(
     meets |= (labels == waits_for)[:, None] & places.on[:, soon]
     meets &= (np.abs(cos) > ALIGNED) | (speed < STANDING)
     meets &= s > state.s + planner.vehicle.middle
-    on = meets.any(1)
+    on = meets.any(1) & ~np.isin(labels, list(skip))
     chance = np.bincount(predictions.track[on], predictions.probability[on], minlength=len(predictions.tracks.label))
     best: Lead | None = None
     for m in np.flatnonzero(on):
-        label = int(labels[m])
+        label, k = int(labels[m]), int(meets[m].argmax())
         if chance[predictions.track[m]] < (KEPT if label == before else LIKELY) and label != waits_for:
             continue
-        k = int(meets[m].argmax())
         pace = float(speed[m, k] * cos[m, k])
+        if s[m, k] - pace * times[k] < state.s + planner.vehicle.middle:
+            continue  # it comes from behind
         if pace < 0:  # towards us: it is met half-way
             k, pace = len(times) - 1, 0.0
         rear = float(s[m, k] - half.along[m, k] - pace * times[k])

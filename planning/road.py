@@ -24,6 +24,7 @@ class Lane(NamedTuple):
     successors    lanes that it leads into
     beside        (lane to the left, lane to the right) or None; opposite: whether each of them is driven the other way
     speed         limit [m/s]
+    gives_way     whether it leads into the lane of others, who go first (a ramp)
     """
 
     left: Floats
@@ -32,6 +33,7 @@ class Lane(NamedTuple):
     beside: tuple[int | None, int | None] = (None, None)
     opposite: tuple[bool, bool] = (False, False)
     speed: float = math.inf
+    gives_way: bool = False
 
     @property
     def centre(self) -> Floats:
@@ -124,6 +126,7 @@ class Route(NamedTuple):
     edges     (N, 4) offsets at s = 0, 1, 2, ... m: far border of the lane to the left (its own where there is none),
               left border, right border, far border of the lane to the right [m]
     opposite  (N, 2) whether the lanes beside are driven the other way
+    joins     (J,) where lanes that give way lead into those of others [m]
     """
 
     line: ReferenceLine
@@ -134,6 +137,7 @@ class Route(NamedTuple):
     outer: tuple[tuple[Floats | None, Floats | None], ...]
     edges: Floats
     opposite: NDArray[np.bool_]
+    joins: Floats
 
     def edges_at(self, s: ArrayLike) -> Floats:
         """(*, 4) at arc lengths (*,)."""
@@ -177,7 +181,9 @@ def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
         ):
             edges[here, column] = _offsets(line, border, grid[here])
     opposite = np.array([lanes[a].opposite for a in ids])[which]
-    return Route(line, tuple(ids), start, np.array([lanes[a].speed for a in ids]), borders, outer, edges, opposite)
+    speed = np.array([lanes[a].speed for a in ids])
+    joins = start[1:][[lanes[a].gives_way for a in ids[:-1]]]
+    return Route(line, tuple(ids), start, speed, borders, outer, edges, opposite, joins)
 
 
 def _far_border(lanes: Lanes, a: int, side: int) -> Floats | None:

@@ -72,7 +72,8 @@ def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
     return (ops.fmax(squared - radius * root - z * ops.sqrt(spread), root * ops.fmax(beside, beyond)),)
 
 
-# |q| times the largest of |q| - R - z sigma and the same along and across the rectangle: positive where a circle at x is clear of a rectangle; covariance in the rectangle's frame
+# |q| times the largest of |q| - R - z sigma and the same along and across the rectangle: positive where a circle at x
+# is clear of it; covariance in the rectangle's frame
 CLEARANCE = Formula("clearance", _clearance, 2, 11)
 
 

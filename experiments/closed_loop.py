@@ -14,14 +14,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiments.scenarios.driving import Body, DriveScene, observe
 from models.program import InputError
-from planning.control import Control, Lags, command, moved
+from planning.control import Command, Control, Lags, command, moved
 from planning.frenet import FrenetState, Pose, to_frenet, to_pose
 from planning.planner import EMERGENCY, Plan, Planner, plan
 from planning.planner import Scene as PlanScene
@@ -35,27 +35,28 @@ SHORTEST = 0.3  # of a lateral motion to its end along an emergency stop [m]
 
 @dataclass(frozen=True)
 class Loop:
-    """Settings.
+    """Settings; a cycle takes as long as the planner's end times are apart (planning.candidates.Fans.cycle).
 
-    cycle      between plans [s]
     world      between movements of other road users, and between looks for contact [s]
     tolerance  from the last plan, within which the next one begins on it [m]
     control    and the time constants the vehicle really has
     """
 
-    cycle: float = 0.15
     world: float = 0.05
     tolerance: float = 0.3
     control: Control = field(default_factory=Control)
     lags: Lags = field(default_factory=Lags)
 
     def __post_init__(self) -> None:
-        for name in ("cycle", "world", "tolerance"):
+        for name in ("world", "tolerance"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"loop: {name} is {getattr(self, name)}, but must be positive and finite")
-        for name, long, short in (("cycle", self.cycle, self.world), ("world", self.world, self.control.step)):
-            if abs(long / short - round(long / short)) > 1e-9:
-                raise InputError(f"loop: {name} is {long} s, but must be a multiple of {short} s")
+        _multiple("world", self.world, "control.step", self.control.step)
+
+
+def _multiple(name: str, long: float, of: str, short: float) -> None:
+    if abs(long / short - round(long / short)) > 1e-9:
+        raise InputError(f"loop: {name} is {long} s, but must be a multiple of {of}, {short} s")
 
 
 class Thought(NamedTuple):
@@ -125,38 +126,44 @@ def drive(
 ) -> Drive:
     """Drive through a scene.
 
-    Raises InputError for a scene that cannot be begun: a route that is none, a vehicle off it."""
+    Raises InputError for a scene that cannot be begun: a route that is none, a vehicle off it; and for time steps that
+    do not fit into one another."""
+    cycle = planner.fans.cycle
+    _multiple("cycle", cycle, "world", loop.world)
+    _multiple("cycle", cycle, "planner.step", planner.step)
     way = route(scene.lanes, scene.route)
     think = mind(scene, way, planner)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     others: list[Pose | None] = [None] * len(scene.actors)
     others = _others(scene, planner.vehicle, 0.0, 0.0, others, scene.ego)
     ego, made, given = scene.ego, None, None
-    driven: list[tuple[Pose, Pose, tuple[float, float]]] = []
+    driven: list[tuple[Pose, Pose, Command]] = []
     looks, cycles, givens, plans = [others], [], [], []
     per_look = round(loop.world / loop.control.step)
-    shared = np.arange(0.0, planner.horizon - loop.cycle + 1e-9, planner.step)
-    for number in range(round(scene.duration / loop.cycle)):
-        now, began, stated, words = number * loop.cycle, time.perf_counter(), "", ""
+    horizon, gone = planner.step * np.arange(planner.num_steps + 1, dtype=np.float64), round(cycle / planner.step)
+    planned: list[Floats] = []
+    for number in range(round(scene.duration / cycle)):
+        now, began, stated, words = number * cycle, time.perf_counter(), "", ""
         tracks = observe(scene, others, rng)
         try:
-            state = _start(way, ego, made, loop)
+            state = _start(way, ego, made, cycle, loop.tolerance)
             given, words = think(now, state, tracks)
-            following = plan(planner, given, made, loop.cycle)
+            following = plan(planner, given, made, cycle)
         except InputError as error:
             if made is None or given is None:
                 raise
             stated = str(error)
-            following = stop_along(planner, made, loop.cycle)
+            following = stop_along(planner, made, cycle)
         ms = 1e3 * (time.perf_counter() - began)
-        apart = math.nan if made is None else _apart(following, made, shared, loop.cycle)
+        planned.append(following.trajectory(horizon))
+        apart = math.nan if made is None else _apart(planned[-1][:-gone], planned[-2][gone:])
         cycles.append(
             (now, ms, following.tier, following.clear, following.cost, apart, given.stop, _aim(given), words, stated)
         )
         givens.append(given)
         plans.append(following)
         made = following
-        poses = [Pose(*row) for row in made.trajectory(np.arange(0.0, loop.cycle + 1e-9, loop.control.step))]
+        poses = [Pose(*row) for row in made.trajectory(np.arange(0.0, cycle + 1e-9, loop.control.step))]
         for k, (wanted, after) in enumerate(pairwise(poses), start=1):
             told = command(loop.control, planner.able, ego, wanted, after)
             driven.append((ego, wanted, told))
@@ -165,7 +172,7 @@ def drive(
                 others = _others(scene, planner.vehicle, now + k * loop.control.step, loop.world, others, ego)
                 looks.append(others)
     driven.append((ego, poses[-1], told))
-    return Drive(scene, way, planner, _log(scene, planner, loop, driven, looks, cycles, plans), givens, plans)
+    return Drive(scene, way, planner, _log(scene, loop, driven, looks, cycles, planned), givens, plans)
 
 
 def stop_along(planner: Planner, last: Plan, elapsed: float) -> Plan:
@@ -194,19 +201,19 @@ def middle_of(vehicle: Vehicle, pose: Pose) -> Pose:
     return pose._replace(x=x, y=y)
 
 
-def _start(way: Route, ego: Pose, last: Plan | None, loop: Loop) -> FrenetState:
+def _start(way: Route, ego: Pose, last: Plan | None, elapsed: float, tolerance: float) -> FrenetState:
     """Where to plan from: on the last plan, or where the vehicle is."""
     if last is None:
         return to_frenet(way.line, ego)
-    state = last.states([loop.cycle])[0]
+    state = last.states([elapsed])[0]
     there = to_pose(way.line, state)
-    if math.hypot(ego.x - there.x, ego.y - there.y) <= loop.tolerance:
+    if math.hypot(ego.x - there.x, ego.y - there.y) <= tolerance:
         return state
     return to_frenet(way.line, ego, state.s)
 
 
-def _apart(following: Plan, last: Plan, t: Floats, elapsed: float) -> float:
-    return float(np.hypot(*(following.trajectory(t) - last.trajectory(t + elapsed))[:, :2].T).max())
+def _apart(one: Floats, other: Floats) -> float:
+    return float(np.hypot(*(one - other)[:, :2].T).max())
 
 
 def _aim(given: PlanScene) -> tuple[float, float]:
@@ -227,7 +234,12 @@ def _others(
 
 
 def _log(
-    scene: DriveScene, planner: Planner, loop: Loop, driven: list, looks: list, cycles: list, plans: list[Plan]
+    scene: DriveScene,
+    loop: Loop,
+    driven: list[tuple[Pose, Pose, Command]],
+    looks: list[list[Pose | None]],
+    cycles: list[tuple[Any, ...]],
+    planned: list[Floats],
 ) -> Log:
     others = np.full((len(looks), len(scene.actors), 5), math.nan)
     for k, look in enumerate(looks):
@@ -235,7 +247,6 @@ def _log(
             if pose is not None:
                 others[k, n] = pose[:5]
     now, ms, tier, clear, cost, apart, stop, aim, words, stated = zip(*cycles, strict=True)
-    horizon = planner.step * np.arange(planner.num_steps + 1, dtype=np.float64)
     ego, wanted, told = (np.array(column, float) for column in zip(*driven, strict=True))
     return Log(
         time=loop.control.step * np.arange(len(driven), dtype=np.float64),
@@ -249,7 +260,7 @@ def _log(
         tier=np.array(tier),
         clear=np.array(clear),
         cost=np.array(cost),
-        planned=np.stack([made.trajectory(horizon) for made in plans]),
+        planned=np.stack(planned),
         consistency=np.array(apart),
         stop=np.array(stop),
         goal=np.array(aim),

@@ -17,7 +17,7 @@ from experiments.closed_loop import Drive
 from experiments.closed_loop_metrics import arc_lengths, limits_driven, outlines
 from experiments.tracking_animation import CIRCLE, ELLIPSE
 from planning.check_kernel import REASONS
-from planning.planner import COMFORT, EMERGENCY, RELAXED, Candidates, plan
+from planning.planner import COMFORT, EMERGENCY, RELAXED, Candidates, candidates_of, judge, plan
 
 Floats = NDArray[np.float64]
 INK, FAINT, KERB, ROUTE = "#1d2430", "#c9ced6", "#5b3f8c", "#8a8f98"
@@ -81,14 +81,11 @@ def cycle_figure(drive: Drive, number: int) -> Figure:
 
 def fan_of(drive: Drive, number: int, most: int) -> Fan:
     """Candidates of a cycle, all judged; of many, evenly by rank of cost."""
-    loop = drive.log.cycle[1] - drive.log.cycle[0] if number else 0.0
-    previous = drive.plans[number - 1] if number else None
-    found = plan(drive.planner, drive.given[number], previous, float(loop), all_reasons=True)
+    previous, cycle = drive.plans[number - 1] if number else None, drive.planner.fans.cycle
+    found = plan(drive.planner, drive.given[number], previous, cycle, all_reasons=True)
     made = found.candidates
     if found.tier == EMERGENCY:  # then these are stops: show what was wanted before them
-        from planning.planner import candidates_of, judge
-
-        made = candidates_of(drive.planner, drive.given[number], previous, float(loop))
+        made = candidates_of(drive.planner, drive.given[number], previous, cycle)
         made = judge(drive.planner, drive.given[number], made, drive.planner.comfort, first_good=False)
     shown = made.order[np.unique(np.linspace(0, len(made.order) - 1, most).astype(int))]
     which, number_of = np.unique(made.reason, return_counts=True)
@@ -126,8 +123,7 @@ def candidate_handles(fan: Fan, colours: dict[int, str]) -> list[Line2D]:
 def draw_cycle(axes: Axes, drive: Drive, number: int, fan: Fan, colours: dict[int, str]) -> None:
     """The world of a cycle, its candidates and its plan; the view goes with the vehicle."""
     log, vehicle, given = drive.log, drive.planner.vehicle, drive.given[number]
-    step = round((log.cycle[1] - log.cycle[0]) / (log.time[1] - log.time[0])) if len(log.cycle) > 1 else 0
-    ego = log.ego[number * step]
+    ego = log.ego[round(log.cycle[number] / (log.time[1] - log.time[0]))]
     ahead = np.array([math.cos(ego[2]), math.sin(ego[2])])
     _view(axes, ego[:2], ahead)
     for lane in drive.scene.lanes.values():

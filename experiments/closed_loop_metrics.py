@@ -1,28 +1,30 @@
 """What a drive is judged by: {metric: value}, of what was driven, not of what was planned.
 
-collisions             road users and boundary lines that were touched (exact rectangles, every look of the loop)
-collisions_at_fault    of these without those who drive into the vehicle from behind
-clearance_m            least distance to a road user
-boundary_clearance_m   least distance to a boundary line
-limit_violations       control steps beyond a limit of the plan's tier (lateral and longitudinal acceleration,
-                       curvature, speed, the lane's speed limit), by more than 2 % of it
-stops_passed           stop points whose line the front passed without permission
-stop_error_m           largest distance of the front from the stop point it stands at
-gap_error_m            at the end behind somebody who keeps a speed: gap against gap + headway * speed
-lateral_acceleration_mps2  largest
-braking_mps2           largest
-jerk_mps3              root mean square along the way
-tracking_m             largest distance from the plan
-consistency_median_m   distance of each plan from the one before over the time that both tell: median
-consistency_p95_m      95 % of cycles are below
-way_m                  driven along the route
-end_speed_mps          at the end
-comfort                share of cycles with a plan within comfortable limits
-relaxed                share with one within what the vehicle can
-emergency              share of emergency stops
-stated                 cycles that could not be planned
-cycle_median_ms        from tracks to plan, without the first cycle, which compiles
-cycle_p99_ms           99 % of cycles take less
+    collisions             road users and boundary lines that were touched
+    collisions_at_fault    of these without those who drive into the vehicle from behind
+    clearance_m            least distance to a road user
+    boundary_clearance_m   least distance to a boundary line
+    limit_violations       control steps beyond a limit on acceleration along or across, curvature or speed
+    stops_passed           stop points whose line the front passed without permission
+    stop_error_m           largest distance of the front from the stop point it stands at
+    gap_error_m            at the end behind somebody who keeps a speed: gap against gap + headway * speed
+    lateral_acceleration_mps2  largest
+    braking_mps2           largest
+    jerk_mps3              root mean square along the way
+    tracking_m             largest distance from the plan
+    consistency_median_m   distance of each plan from the one before over the time that both tell: median
+    consistency_p95_m      95 % of cycles are below
+    way_m                  driven along the route
+    end_speed_mps          at the end
+    comfort                share of cycles with a plan within comfortable limits
+    relaxed                share with one within what the vehicle can
+    emergency              share of emergency stops
+    stated                 cycles that could not be planned
+    cycle_median_ms        from tracks to plan, without the first cycle, which compiles
+    cycle_p99_ms           99 % of cycles take less
+
+Rectangles are exact and looked at every 50 ms (experiments.closed_loop.Loop.world). Limits are those of the tier of the
+plan that is driven, and the lane's speed limit; 2 % more is no violation.
 """
 
 from __future__ import annotations

@@ -39,8 +39,9 @@ def by_the_rules(
             planner, route, state, predictions, scene.stops, permissions, behaved, manners, places=places
         )
         decided = permissions.memory
-        lines = [*given.boundary.segment.reshape(-1, 2, 2), *scene.boundary]
-        reasons = [f"{name}: {why}" for name, why in permissions.reasons.items()]
-        return Thought(given._replace(boundary=boundary(lines, planner.radius)), "; ".join([behaved.goal, *reasons]))
+        if scene.boundary:
+            lines = [*given.boundary.segment.reshape(-1, 2, 2), *scene.boundary]
+            given = given._replace(boundary=boundary(lines, planner.radius))
+        return Thought(given, "; ".join([behaved.goal, *(f"{k}: {why}" for k, why in permissions.reasons.items())]))
 
     return think

@@ -80,7 +80,7 @@ def merge(*, gap: float = 45.0, duration: float = 25.0) -> DriveScene:
         2: _lane(ramp, joint, ramp.length, 0.0),
         3: _lane(main, 0.0, 230.0, 0.0, successors=(2,)),
     }
-    cars = tuple(Reacting(main, 100.0 + k * gap, 9.0, 9.0) for k in range(-2, 3))
+    cars = tuple(Reacting(main, 90.0 + k * gap, 9.0, 9.0) for k in range(-2, 3))
     kerbs = (_beside(main, WIDTH / 2), _beside(ramp, -WIDTH / 2))
     ego = to_pose(ramp, FrenetState(10.0, 9.0, 0.0, 0.0))
     return DriveScene("merge", lanes, (1, 2), (), {}, cars, kerbs, ego, duration, info={"gap_m": gap})

@@ -13,9 +13,15 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import MISSING, OmegaConf
 
 import experiments.command  # noqa: F401  (installs the schemas)
+from experiments.closed_loop import Loop
 from experiments.command import in_words, plain
+from experiments.scenarios.driving import DriveScene
 from experiments.schema import build, check_values, expand
 from experiments.signatures import ConfigError, knobs, locate
+from planning.behaviour import Manners
+from planning.decision import Rules
+from planning.planner import Planner
+from planning.situation import Situation
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 OPTIONS = [
@@ -32,15 +38,31 @@ def hydra_context() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize(("group", "name"), OPTIONS)
+@pytest.mark.parametrize(("group", "name"), [option for option in OPTIONS if option[0] != "planner"])
 def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: str) -> None:
     config = plain(compose("run", [f"{group}={name}"]))
+    check_targets(config)
+    build(config["model"], "model")
+    build({key: config[key] for key in ("engine", "functionals", "metrics", "figures")})
+
+
+@pytest.mark.parametrize(
+    ("group", "name"), [(g, n) for g, n in OPTIONS if g == "planner" or (g == "scenario" and n.startswith("drive_"))]
+)
+def test_every_config_of_a_drive_composes_and_builds_what_the_code_has_as_defaults(group: str, name: str) -> None:
+    config = plain(compose("drive", [f"{group}={name}"]))
+    check_targets(config)
+    parts = build({key: config[key] for key in ("scenario", "driver", "planner", "loop", "metrics", "figures")})
+    assert isinstance(parts["scenario"], DriveScene)
+    assert (parts["planner"], parts["loop"]) == (Planner(), Loop())
+    assert parts["driver"].keywords == {"situation": Situation(), "rules": Rules(), "manners": Manners()}
+
+
+def check_targets(config: Any) -> None:
     for target in targets_of(config):
         function = locate(target["_target_"])
         keys = {key: 0 for key in target if not key.startswith("_")}
         inspect.signature(function).bind_partial(**keys)  # raises TypeError for a key it does not take
-    build(config["model"], "model")
-    build({key: config[key] for key in ("engine", "functionals", "metrics", "figures")})
 
 
 def targets_of(node: Any) -> Iterator[dict[str, Any]]:

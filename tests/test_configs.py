@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,8 @@ class Model(Base):
     colour: Literal["red", "green"] = "red"
     limit: int | None = None
     inner: Base = Base()
+    made: Base = field(default_factory=Base)
+    other: Base = field(default_factory=lambda: Base(width=3.0))
 """
 
 
@@ -138,9 +141,11 @@ def test_a_signature_outside_the_tree_is_read_with_its_base_class(package: str) 
     read = knobs(f"{package}.Model")
     assert {name: knob.default for name, knob in read.items()} == {
         "width": 2.0, "needed": 0, "angle": 1.5707963267948966, "pair": (1.0, 2.0),
-        "colour": "red", "limit": None, "inner": MISSING,
+        "colour": "red", "limit": None, "inner": MISSING, "made": MISSING, "other": MISSING,
     }  # fmt: skip
     assert read["colour"].choices == ("red", "green")
+    assert not any(knob.required for knob in read.values())
+    assert package not in sys.modules, "it is read without an import"
 
 
 def test_a_tuple_stays_a_tuple_and_an_unshown_default_stays_the_targets_own(package: str) -> None:

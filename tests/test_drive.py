@@ -275,6 +275,12 @@ def test_what_is_no_record_or_loop_is_refused() -> None:
         Loop(control=Control(step=0.02))
     with pytest.raises(InputError, match=r"loop: cycle is 0.16 s, but must be a multiple of world, 0.05 s"):
         drive(driven_roads.box(), steady(), Planner(fans=Fans(cycle=0.16)))
+    with pytest.raises(InputError, match=r"duration is 0.1 s, but must be a cycle"):
+        drive(driven_roads.box(duration=0.1), steady())
+    with pytest.raises(InputError, match="noise: position is -1"):
+        driven_roads.follow(noise=-1.0)
+    with pytest.raises(InputError, match=r"gap is 5.0 m"):
+        driven_roads.merge(gap=5.0)
     with pytest.raises(InputError, match="tolerance is 0"):
         Loop(tolerance=0.0)
     with pytest.raises(InputError, match=r"one to drive in.*python -m experiments.drive"):

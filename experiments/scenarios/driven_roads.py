@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.scenarios.driving import Actor, DriveScene, Noise, Reacting, Scripted
+from experiments.scenarios.driving import CAR, Actor, DriveScene, Noise, Reacting, Scripted
+from models.program import InputError
 from planning.frenet import FrenetState, to_pose
 from planning.reference import ReferenceLine, from_curvature, from_points
 from planning.road import Lane, Lanes, StopPoint
@@ -69,6 +70,8 @@ def cut_in(*, noise: float = 0.0, duration: float = 25.0) -> DriveScene:
 
 def merge(*, gap: float = 45.0, duration: float = 25.0) -> DriveScene:
     """From a ramp into a road with cars that drive `gap` metres apart and react to who is ahead of them."""
+    if not gap > 2 * CAR[0]:
+        raise InputError(f"merge: gap is {gap} m, but must be more than two cars, {2 * CAR[0]} m")
     s = np.arange(0.0, 601.0, 2.0)
     main = from_points(np.stack([s, np.zeros_like(s)], -1))
     u = np.clip((s - 160.0) / 80.0, 0.0, 1.0)  # of the way over from the ramp

@@ -179,6 +179,11 @@ class Noise:
     speed: float = 0.0
     acceleration: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"noise: {name} is {getattr(self, name)}, but must be 0 or more and finite")
+
 
 class DriveScene(NamedTuple):
     """One scene to drive in.

@@ -49,7 +49,7 @@ class Manners:
     """
 
     braking: float = 2.0
-    lag: float = 1.0
+    lag: float = 1.5
     lateral_acceleration: float = 1.6
     ahead: float = 120.0
     gap: float = 4.0
@@ -71,13 +71,14 @@ class Manners:
 
 
 class Memory(NamedTuple):
-    """What the behavioural layer remembers: the goal's word, the lead (a label, or -1), passing, and the gap (labels
-    of the vehicles ahead and behind, or -1)."""
+    """What the behavioural layer remembers: the goal's word, the lead (a label, or -1), passing, the gap (labels of
+    the vehicles ahead and behind, or -1), and whether one goes into it."""
 
     goal: str = KEEP
     lead: int = -1
     passing: Passing = Passing()
     gap: tuple[int, int] = (-1, -1)
+    into: bool = False
 
 
 def behave(
@@ -101,14 +102,17 @@ def behave(
     beside, centre = lane_beside(route, state)
     around = passing(planner, route, state, predictions, told, stop_points, memory.passing, manners.release)
     movers = [] if around.going else movers_of(planner, route, state, predictions, told, manners.gaps)
-    wanted, gap = around.offset if around.going else 0.0, None
+    wanted, gap, into = around.offset if around.going else 0.0, None, False
     if movers:
         middle, limit = state.s + vehicle.middle, float(route.limit_at(np.array([state.s]))[0])
         join = min(
             (float(s) - manners.gaps.stop for s in route.joins if s - manners.gaps.stop > front), default=math.inf
         )
         gap = choose_gap(movers, middle, vehicle.length, limit, memory.gap, manners.gaps, way=join - front)
-        if not gap.open(middle, state.ds, vehicle.length, manners.gaps):
+        into = gap.open(middle, state.ds, vehicle.length, manners.gaps)
+        near = abs(gap.missing(middle, vehicle.length, manners.gaps)) < manners.gaps.room
+        into |= memory.into and gap.labels == memory.gap and near
+        if not into:
             wanted = centre
             if join - front > state.ds**2 / (2 * manners.braking):
                 line = min(line, join)
@@ -135,7 +139,8 @@ def behave(
         max(line, front),
         line if lead is None else min(line, lead.stands(planner)),
     )
-    return scene, Memory(word, -1 if lead is None else lead.label, around, (-1, -1) if gap is None else gap.labels)
+    labels = (-1, -1) if gap is None else gap.labels
+    return scene, Memory(word, -1 if lead is None else lead.label, around, labels, into)
 
 
 def lane_beside(route: Route, state: FrenetState) -> tuple[bool, float]:
@@ -200,7 +205,8 @@ def choose(
     slack = manners.hysteresis if memory.goal == STOP else 1.0
     if line - front <= slack * braking_way(state.ds, manners):
         found.append((line, _reachable(stop(line - manners.before, vehicle.front), state), STOP))
-    if lead is not None:
+    # in a gap one follows neither of its vehicles: the one behind comes up meanwhile
+    if lead is not None and (gap is None or gap.behind is None or gap.labels[0] != lead.label):
         room = manners.room if lead.label == waits_for else manners.gap
         target = follow(lead.rear, lead.speed, lead.acceleration, vehicle.front, gap=room, headway=manners.headway)
         slack = manners.hysteresis if (memory.goal, memory.lead) == (FOLLOW, lead.label) else 1.0

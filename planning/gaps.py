@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from models.program import InputError
-from planning.candidates import Goal, Keep, merge
+from planning.candidates import Goal, Keep, Reach
 from planning.frenet import FrenetState
 from planning.planner import Planner
 from planning.release import extent
@@ -36,7 +36,7 @@ class Gaps:
     """Settings of merging.
 
     room, headway  kept to both vehicles of a gap [m, s]
-    look           how long one must be in a gap to go into it [s]
+    acceleration   with which one gets as fast as a gap's vehicles [m/s^2]
     shift, within  faster or slower than the gap [m/s], by what is missing within a time [s]
     hold           [s]
     chance         that a vehicle is there, from which on it counts
@@ -45,7 +45,7 @@ class Gaps:
 
     room: float = 2.0
     headway: float = 0.6
-    look: float = 2.0
+    acceleration: float = 1.5
     shift: float = 3.0
     within: float = 3.0
     hold: float = 3.0
@@ -80,24 +80,25 @@ class Gap(NamedTuple):
         """Of both, -1 for none."""
         return (-1 if self.ahead is None else self.ahead.label, -1 if self.behind is None else self.behind.label)
 
-    def span(self, length: float, settings: Gaps, t: float = 0.0) -> tuple[float, float]:
-        """In which the own middle may be in a time t; empty where least > largest."""
+    def span(self, length: float, settings: Gaps) -> tuple[float, float]:
+        """In which the own middle may be; empty where least > largest."""
         low, high = -math.inf, math.inf
         if self.behind is not None:
             _, s, half, v, _ = self.behind
-            low = s + v * t + half + settings.room + settings.headway * v + length / 2
+            low = s + half + settings.room + settings.headway * v + length / 2
         if self.ahead is not None:
             _, s, half, v, _ = self.ahead
-            high = s + v * t - half - settings.room - settings.headway * v - length / 2
+            high = s - half - settings.room - settings.headway * v - length / 2
         return low, high
 
     def open(self, middle: float, speed: float, length: float, settings: Gaps) -> bool:
-        """Whether one is in it, now and soon."""
-        for t in (0.0, settings.look):
-            low, high = self.span(length, settings, t)
-            if not low <= middle + speed * t <= high:
-                return False
-        return True
+        """Whether one is in it, and still is when one has got as fast as its vehicles."""
+        low, high = self.span(length, settings)
+        if self.behind is not None:
+            low += max(self.behind.speed - speed, 0.0) ** 2 / (2 * settings.acceleration)
+        if self.ahead is not None:
+            high -= max(speed - self.ahead.speed, 0.0) ** 2 / (2 * settings.acceleration)
+        return low <= middle <= high
 
     def missing(self, middle: float, length: float, settings: Gaps) -> float:
         """How far one has to shift into it, ahead where positive [m]."""
@@ -105,7 +106,7 @@ class Gap(NamedTuple):
         return max(low - middle, 0.0) - max(middle - high, 0.0)
 
     def goal(self, state: FrenetState, middle: float, length: float, speed: float, settings: Gaps) -> Goal | None:
-        """Faster or slower than the gap until one is in it, then midway between its vehicles, if it has both.
+        """Faster or slower than the gap until one is in it, then as fast as its vehicles, if it has both.
 
         middle  ahead of the reference point [m]; speed  wanted if there were no gap [m/s]"""
         shift = self.missing(state.s + middle, length, settings)
@@ -117,8 +118,12 @@ class Gap(NamedTuple):
             return Keep(min(speed, max(ahead.speed - slower, 0.0)))
         if ahead is None or behind is None:
             return None
-        found = merge((ahead.s - ahead.half - middle, ahead.speed), (behind.s + behind.half - middle, behind.speed))
-        return found if found.speed <= speed else Keep(speed)
+        # where one is, a little inside: to go for its middle would mean to be slower or faster for longer
+        low, high = self.span(length, settings)
+        inset = min(settings.room, (high - low) / 2)
+        place = min(max(state.s + middle, low + inset), high - inset)
+        pace = (ahead.speed + behind.speed) / 2
+        return Reach(place - middle, pace) if pace <= speed + SLOWEST else Keep(speed)
 
 
 def choose_gap(

@@ -94,14 +94,15 @@ def from_points(points: ArrayLike, *, std: float = 0.05, name: str = "reference 
     chord = np.r_[0.0, np.cumsum(np.hypot(*np.diff(given, axis=0).T))]
     degree = min(5, len(given) - 1)
     curve, _ = make_splprep(given.T, u=chord, k=degree, s=len(given) * std**2)
-    first, second, third = (curve.derivative(n) for n in (1, 2, 3))
+    first, second = curve.derivative(1), curve.derivative(2)
     fine = np.linspace(0.0, chord[-1], max(int(chord[-1] / FINE), 100) + 1)
     pace = np.hypot(*first(fine))
     arc = cumulative_simpson(pace, x=fine, initial=0.0)
     num = max(round(arc[-1] / STEP), 1)
     step = float(arc[-1] / num)
     u = CubicHermiteSpline(arc, fine, 1.0 / pace)(np.linspace(0.0, arc[-1], num + 1))
-    (x, y), (x1, y1), (x2, y2), (x3, y3) = curve(u), first(u), second(u), third(u)
+    (x, y), (x1, y1), (x2, y2) = curve(u), first(u), second(u)
+    x3, y3 = curve.derivative(3)(u) if degree > 2 else np.zeros((2, num + 1))  # three points make a parabola
     v = np.hypot(x1, y1)
     cross = x1 * y2 - y1 * x2
     kappa = cross / v**3

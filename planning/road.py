@@ -14,6 +14,7 @@ from models.program import InputError
 from planning.reference import ReferenceLine, from_points
 
 Floats = NDArray[np.float64]
+SMOOTH = 6  # points of a lane's middle at least: a quintic
 EDGE = 1.0  # between the offsets of borders along a route [m]
 
 
@@ -38,7 +39,7 @@ class Lane(NamedTuple):
     @property
     def centre(self) -> Floats:
         """(K, 2) midway between the borders, at equal shares of their lengths."""
-        num = max(len(self.left), len(self.right), 3)
+        num = max(len(self.left), len(self.right), SMOOTH)
         return (even(self.left, num) + even(self.right, num)) / 2
 
 

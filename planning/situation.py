@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,6 @@ from planning.shapes import Obstacles
 
 Ints = NDArray[np.int64]
 NO_LANE = -1
-NEAR = 5.0  # a lane is looked at where a track is this near to the box around it [m]
 COARSE = 16  # rows of a route's table between those that a search for the foot starts at
 JOINT = 0.5  # a lane's line goes on for this beyond its ends: lines that join may leave a gap [m]
 STEEPEST = 1.2  # |d'| at which a track that turns away from a lane is believed to go
@@ -63,7 +63,7 @@ class Situation:
     lane_std: float = 0.25
     turn_std: float = 0.1
     walk_std: float = 0.3
-    later: float = 10.0
+    later: float = 15.0
     step: float = 0.25
 
     def __post_init__(self) -> None:
@@ -94,7 +94,7 @@ def network(lanes: Lanes, *, std: float = 0.05) -> Network:
             if after not in lanes:
                 raise InputError(f"lane {key} leads to lane {after}, which the map has not; leave it out or add it")
         lines[key] = from_points(lane.centre, std=std, name=f"lane {key}")
-        num = max(len(lane.left), len(lane.right), 3)
+        num = max(len(lane.left), len(lane.right))
         half[key] = np.hypot(*(even(lane.left, num) - even(lane.right, num)).T) / 2
         both = np.concatenate([lane.left, lane.right])
         boxes.append(np.r_[both.min(0), both.max(0)][None])
@@ -122,30 +122,33 @@ def relations(roads: Network, tracks: Tracks, settings: Situation = Situation())
 
     check_tracks(tracks)
     ids = np.array(list(roads.lanes), np.int64)
-    num = len(tracks.label)
-    weight, s, d, slope = np.zeros((4, num, len(ids)))
     x, y = tracks.position[:, :1], tracks.position[:, 1:]
-    low, high = roads.box[:, :2] - NEAR, roads.box[:, 2:] + NEAR
-    near = (x >= low[:, 0]) & (x <= high[:, 0]) & (y >= low[:, 1]) & (y <= high[:, 1])
+    reach = JOINT + 4.0 * np.sqrt(tracks.covariance.trace(axis1=1, axis2=2))[:, None]  # beyond it no mass is left
+    least_x, least_y, most_x, most_y = roads.box.T
+    near = (x >= least_x - reach) & (x <= most_x + reach) & (y >= least_y - reach) & (y <= most_y + reach)
     near &= ((tracks.kind != "pedestrian") & (tracks.speed >= 0))[:, None]
-    for col in np.flatnonzero(near.any(0)):
-        rows = np.flatnonzero(near[:, col])
-        line, half = roads.lines[int(ids[col])], roads.half[int(ids[col])]
-        found, ended = line.project(tracks.position[rows])
-        told = line.at(found[:, 0])
-        across = np.stack([-np.sin(told[:, 2]), np.cos(told[:, 2])], -1)
-        ahead = np.einsum("mi,mi->m", tracks.position[rows] - told[:, :2], np.stack([across[:, 1], -across[:, 0]], -1))
-        on = (ended == FOUND) | ((ended == BEYOND_ENDS) & (np.abs(ahead) < JOINT))
-        std = np.sqrt(np.maximum(np.einsum("mi,mij,mj->m", across, tracks.covariance[rows], across), 1e-6))
-        wide = np.interp(found[:, 0] / line.length, np.linspace(0.0, 1.0, len(half)), half)
-        turned = np.remainder(tracks.heading[rows] - told[:, 2] + math.pi, 2 * math.pi) - math.pi
-        mass = ndtr((wide - found[:, 1]) / std) - ndtr((-wide - found[:, 1]) / std)
-        weight[rows, col] = on * mass * np.exp(-((turned / settings.heading_std) ** 2) / 2)
-        s[rows, col], d[rows, col] = found.T
-        slope[rows, col] = np.clip(np.tan(np.clip(turned, -1.5, 1.5)), -STEEPEST, STEEPEST)
-    total = weight.sum(1, keepdims=True)
-    on_lane = weight / np.maximum(total, 1.0)
-    return Relations(ids, np.hstack([on_lane, np.maximum(1.0 - total, 0.0)]), s, d, slope)
+    row, col = np.nonzero(near.T)[::-1]  # lane by lane
+    told, ended = np.zeros((len(row), 6)), np.zeros(len(row), np.int64)  # s, d, x, y, theta, half the width
+    for begin, end in pairwise([*np.flatnonzero(np.diff(col, prepend=-1)), len(row)]):
+        lane = int(ids[col[begin]])
+        line, half, part = roads.lines[lane], roads.half[lane], told[begin:end]
+        part[:, :2], ended[begin:end] = line.project(tracks.position[row[begin:end]])
+        part[:, 2:5] = line.at(part[:, 0])[:, :3]
+        part[:, 5] = np.interp(part[:, 0] / line.length, np.linspace(0.0, 1.0, len(half)), half)
+    s, d, _, _, theta, wide = told.T
+    left = np.stack([-np.sin(theta), np.cos(theta)], -1)
+    off = tracks.position[row] - told[:, 2:4]
+    ahead = off[:, 0] * left[:, 1] - off[:, 1] * left[:, 0]
+    on = (ended == FOUND) | ((ended == BEYOND_ENDS) & (np.abs(ahead) < JOINT))
+    std = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", left, tracks.covariance[row], left), 1e-6))
+    turned = np.remainder(tracks.heading[row] - theta + math.pi, 2 * math.pi) - math.pi
+    mass = ndtr((wide - d) / std) - ndtr((-wide - d) / std)
+    slope = np.clip(np.tan(np.clip(turned, -1.5, 1.5)), -STEEPEST, STEEPEST)
+    found = np.zeros((4, *near.shape))
+    found[:, row, col] = on * mass * np.exp(-((turned / settings.heading_std) ** 2) / 2), s, d, slope
+    total = found[0].sum(1, keepdims=True)
+    chance = np.hstack([found[0] / np.maximum(total, 1.0), np.maximum(1.0 - total, 0.0)])
+    return Relations(ids, chance, *found[1:])
 
 
 class Predictions(NamedTuple):

@@ -95,3 +95,8 @@ def test_bad_lines_are_refused_in_words(points: np.ndarray, words: str) -> None:
     with pytest.raises(InputError, match=r"lane 7: .*") as refused:
         from_points(points, std=0.0, name="lane 7")
     assert words in str(refused.value)
+
+
+def test_three_points_make_a_line() -> None:
+    line = from_points([(0.0, 0.0), (50.0, 0.0), (100.0, 0.0)], std=0.0)
+    np.testing.assert_allclose(line.at(30.0), [30.0, 0.0, 0.0, 0.0, 0.0], atol=1e-9)

@@ -126,8 +126,8 @@ def drive(
 ) -> Drive:
     """Drive through a scene.
 
-    Raises InputError for a scene that cannot be begun (a route that is none, a vehicle off it, no time to drive) and for
-    time steps that do not fit into one another."""
+    Raises InputError for a scene that cannot be begun (a route that is none, a vehicle off it, no time to drive), and
+    for time steps that do not fit into one another."""
     cycle = planner.fans.cycle
     if not cycle <= scene.duration < math.inf:
         raise InputError(f"scene {scene.name}: duration is {scene.duration} s, but must be a cycle, {cycle} s, or more")

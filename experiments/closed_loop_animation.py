@@ -69,9 +69,7 @@ class Animation:
 def _colour(reason: int) -> str:
     from planning.check_kernel import REASONS
 
-    if reason == 0:
-        return GOOD
-    return GROUPS.get(REASONS[reason], REST) if reason > 0 else REST
+    return GROUPS.get(REASONS[reason], REST) if reason else GOOD
 
 
 def _handles() -> list[Any]:

@@ -34,7 +34,9 @@ BEFORE = 0.4  # share of it that the vehicle is before its middle
 
 
 class Fan(NamedTuple):
-    """Candidates of a cycle as they are drawn: paths (N, K, 2), the reason each is bad for (N,), {reason: number}."""
+    """Candidates of a cycle as they are drawn: paths (N, K, 2), the reason each is bad for (N,), {reason: how many}.
+
+    Reasons of one name are told as the first of them."""
 
     path: Floats
     reason: NDArray[np.int64]
@@ -47,8 +49,9 @@ def figures(drive: Drive) -> dict[str, Figure]:
 
 
 def busiest(drive: Drive) -> int:
-    """The cycle whose plan turned most candidates down."""
-    return int(np.argmax([sum(made.rejected.values()) for made in drive.plans]))
+    """The cycle whose plan turned most candidates down; the one in the middle where none was."""
+    turned_down = [sum(made.rejected.values()) for made in drive.plans]
+    return int(np.argmax(turned_down)) if any(turned_down) else len(turned_down) // 2
 
 
 def cycle_figure(drive: Drive, number: int) -> Figure:
@@ -88,9 +91,11 @@ def fan_of(drive: Drive, number: int, most: int) -> Fan:
         made = candidates_of(drive.planner, drive.given[number], previous, cycle)
         made = judge(drive.planner, drive.given[number], made, drive.planner.comfort, first_good=False)
     shown = made.order[np.unique(np.linspace(0, len(made.order) - 1, most).astype(int))]
-    which, number_of = np.unique(made.reason, return_counts=True)
-    count = dict(zip(which.tolist(), number_of.tolist(), strict=True))
-    return Fan(_paths(drive, number, made, shown), made.reason[shown], count)
+    reason = np.array([REASONS.index(name) for name in REASONS])[made.reason]
+    which, numbers = np.unique(reason, return_counts=True)
+    return Fan(
+        _paths(drive, number, made, shown), reason[shown], dict(zip(which.tolist(), numbers.tolist(), strict=True))
+    )
 
 
 def _paths(drive: Drive, number: int, made: Candidates, shown: NDArray[np.int64]) -> Floats:
@@ -112,10 +117,9 @@ def colours_of(fan: Fan) -> dict[int, str]:
 
 def candidate_handles(fan: Fan, colours: dict[int, str]) -> list[Line2D]:
     """For the legend, with numbers."""
-    words = {0: "good"} | {r: REASONS[r] for r in fan.numbers if r > 0}
     order = sorted(fan.numbers, key=lambda reason: (reason != 0, -fan.numbers[reason]))
     return [
-        Line2D([], [], color=colours.get(r, REST), lw=1.4, label=f"{words.get(r, 'not judged')}: {fan.numbers[r]}")
+        Line2D([], [], color=colours[r], lw=1.4, label=f"{REASONS[r] if r else 'good'}: {fan.numbers[r]}")
         for r in order
     ]
 
@@ -132,7 +136,7 @@ def draw_cycle(axes: Axes, drive: Drive, number: int, fan: Fan, colours: dict[in
     axes.plot(*drive.route.line.table[::4, :2].T, color=ROUTE, lw=1.0, ls="--", zorder=1)
     axes.add_collection(LineCollection(list(given.boundary.segment.reshape(-1, 2, 2)), colors=KERB, lw=1.8, zorder=2))
     axes.add_collection(
-        LineCollection(list(fan.path), colors=[colours.get(int(r), REST) for r in fan.reason], lw=0.5, alpha=0.45)
+        LineCollection(list(fan.path), colors=[colours[int(r)] for r in fan.reason], lw=0.5, alpha=0.45)
     )
     _predictions(axes, drive, number)
     look = round(log.cycle[number] / (log.looked[1] - log.looked[0]))

@@ -209,9 +209,10 @@ def test_touched_walls_and_broken_limits_are_counted() -> None:
     assert metrics(through)["boundary_clearance_m"] == 0.0
     quick = drive(driven_roads.follow(duration=3.0)._replace(actors=()), steady(9.0))
     assert not violations(quick).any()
-    for column, value in ((3, 14.5), (4, 3.1), (4, -5.2), (5, 0.03)):
+    for values in ({3: 14.5}, {4: 3.1}, {4: -5.2}, {5: 0.03}, {3: 1.0, 5: 0.21}):
         ego = quick.log.ego.copy()
-        ego[100:, column] = value
+        for column, value in values.items():
+            ego[100:, column] = value
         assert violations(quick._replace(log=quick.log._replace(ego=ego)))[100:].all()
     stopped = quick._replace(log=quick.log._replace(stop=np.full(len(quick.log.stop), 30.0)))
     assert metrics(stopped)["stops_passed"] == 1.0

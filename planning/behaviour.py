@@ -21,11 +21,11 @@ from models.program import InputError
 from planning.candidates import Goal, Keep, Reach, follow, stop
 from planning.decision import PAST, Permissions
 from planning.frenet import FrenetState, to_pose
-from planning.gaps import Gap, Gaps, choose_gap, movers_of
+from planning.gaps import Gap, Gaps, merging, movers_of
 from planning.leads import Lead, lead_of
 from planning.planner import Planner, Scene
 from planning.release import LEFT, RIGHT, Passing, Release, passing
-from planning.road import Floats, Route, StopPoint
+from planning.road import EDGE, Floats, Route, StopPoint
 from planning.shapes import Boundary, boundary
 from planning.situation import Along, Predictions, along
 from planning.speeds import speed_ahead, speed_before
@@ -102,23 +102,11 @@ def behave(
     beside, centre = lane_beside(route, state)
     around = passing(planner, route, state, predictions, told, stop_points, memory.passing, manners.release)
     movers = [] if around.going else movers_of(planner, route, state, predictions, told, manners.gaps)
-    wanted, gap, into = around.offset if around.going else 0.0, None, False
-    if movers:
-        middle, limit = state.s + vehicle.middle, float(route.limit_at(np.array([state.s]))[0])
-        join = min(
-            (float(s) - manners.gaps.stop for s in route.joins if s - manners.gaps.stop > front), default=math.inf
-        )
-        gap = choose_gap(movers, middle, vehicle.length, limit, memory.gap, manners.gaps, way=join - front)
-        into = gap.open(middle, state.ds, vehicle.length, manners.gaps)
-        near = abs(gap.missing(middle, vehicle.length, manners.gaps)) < manners.gaps.room
-        into |= memory.into and gap.labels == memory.gap and near
-        if not into:
-            wanted = centre
-            if join - front > state.ds**2 / (2 * manners.braking):
-                line = min(line, join)
+    merge = merging(planner, route, state, movers, (memory.gap, memory.into), manners.braking, manners.gaps)
+    line, gap = min(line, merge.line), merge.gap
+    wanted = around.offset if around.going else centre if gap is not None and not merge.into else 0.0
     waits_for = -1 if around.going else around.blocker
-    joining = [mover.label for mover in movers if mover.joins]
-    lead = lead_of(planner, state, predictions, told, wanted, memory.lead, waits_for, joining)
+    lead = lead_of(planner, state, predictions, told, wanted, memory.lead, waits_for, merge.joining)
     if beside and not around.going:
         here = lead_of(planner, state, predictions, told, state.d, memory.lead)
         lead = min((one for one in (lead, here) if one is not None), key=lambda one: one.rear, default=None)
@@ -139,17 +127,17 @@ def behave(
         max(line, front),
         line if lead is None else min(line, lead.stands(planner)),
     )
-    labels = (-1, -1) if gap is None else gap.labels
-    return scene, Memory(word, -1 if lead is None else lead.label, around, labels, into)
+    return scene, Memory(word, -1 if lead is None else lead.label, around, merge.labels, merge.into)
 
 
 def lane_beside(route: Route, state: FrenetState) -> tuple[bool, float]:
-    """Whether the vehicle is on a lane beside the route's, and the offset of that lane's middle [m]."""
+    """Whether the vehicle is on a lane beside the route's that runs the same way, and the offset of its middle [m]."""
     far_left, left, right, far_right = map(float, route.edges_at(np.array([state.s]))[0])
-    if state.d > left:
-        return True, (far_left + left) / 2 if far_left > left else left
-    if state.d < right:
-        return True, (far_right + right) / 2 if far_right < right else right
+    opposite = route.opposite[min(int(state.s / EDGE), len(route.opposite) - 1)]
+    if state.d > left and far_left > left and not opposite[LEFT]:
+        return True, (far_left + left) / 2
+    if state.d < right and far_right < right and not opposite[RIGHT]:
+        return True, (far_right + right) / 2
     return False, 0.0
 
 

@@ -188,3 +188,43 @@ def movers_of(
         s = float(places.s[m, late] - predictions.way[m, late])
         found[label] = Mover(label, s, float(half.along[m, late]), float(predictions.speed[m, 0]), late > 0)
     return [mover for label, mover in found.items() if chances[label] > settings.chance]
+
+
+class Merging(NamedTuple):
+    """The gap, whether one goes into it, s before which one stands while one does not (of a lane that joins, [m]), and
+    the labels of those who drive on another lane yet."""
+
+    gap: Gap | None = None
+    into: bool = False
+    line: float = math.inf
+    joining: tuple[int, ...] = ()
+
+    @property
+    def labels(self) -> tuple[int, int]:
+        """Of the gap's vehicles."""
+        return (-1, -1) if self.gap is None else self.gap.labels
+
+
+def merging(
+    planner: Planner,
+    route: Route,
+    state: FrenetState,
+    movers: list[Mover],
+    before: tuple[tuple[int, int], bool],
+    braking: float,
+    settings: Gaps = Gaps(),
+) -> Merging:
+    """The gap between movers that is gone for; who went into one goes on as long as it is there.
+
+    before  labels of the gap of the last cycle and whether one went into it; braking  of a comfortable stop [m/s^2]"""
+    if not movers:
+        return Merging()
+    vehicle, limit = planner.vehicle, float(route.limit_at(np.array([state.s]))[0])
+    middle, front = state.s + vehicle.middle, state.s + vehicle.front
+    line = min((float(s) - settings.stop for s in route.joins if s - settings.stop > front), default=math.inf)
+    gap = choose_gap(movers, middle, vehicle.length, limit, before[0], settings, way=line - front)
+    near = abs(gap.missing(middle, vehicle.length, settings)) < settings.room
+    into = gap.open(middle, state.ds, vehicle.length, settings) or (before == (gap.labels, True) and near)
+    if into or line - front < state.ds**2 / (2 * braking):
+        line = math.inf
+    return Merging(gap, into, line, tuple(mover.label for mover in movers if mover.joins))

@@ -19,6 +19,7 @@ from planning.behaviour import FOLLOW, KEEP, MERGE, STOP, Manners, Memory, behav
 from planning.candidates import Keep
 from planning.decision import Decided, Light, Permissions
 from planning.frenet import FrenetState, to_pose
+from planning.leads import Lead
 from planning.planner import COMFORT
 from planning.road import Lane, StopPoint, route
 from planning.situation import network, predict
@@ -166,6 +167,22 @@ def test_one_brakes_for_a_standing_car_beyond_the_horizon() -> None:
     far, near = (scene_of([User(x, 0.0)], state=state)[0] for x in (120.0, 65.0))
     assert far.goal == Keep(10.0) and near.goal != Keep(10.0)
     assert near.stand == pytest.approx(65.0 - 2.3 - 1.0, abs=0.01)
+
+
+def test_behind_a_lead_one_can_stand_if_it_brakes_all_it_can_after_the_horizon() -> None:
+    lead = Lead(0, 60.0, 8.0, 0.0, 0.5)
+    assert lead.stands(PLANNER) == pytest.approx(60.0 + 24.0 + 64.0 / 16.0 - 1.0 - 0.5)
+    slows = lead._replace(acceleration=-1.0)
+    assert slows.stands(PLANNER) == pytest.approx(60.0 + 24.0 - 4.5 + 25.0 / 16.0 - 1.0 - 0.5)
+    assert lead._replace(acceleration=-4.0).stands(PLANNER) == pytest.approx(60.0 + 8.0 - 1.0)
+
+
+def test_a_goal_is_left_later_than_it_is_taken() -> None:
+    """Between once and one and a half times the way of comfortable braking, the lead is followed if it was before."""
+    user, words = [User(85.0, 0.0, 0.0, 6.0)], []
+    for memory in (Memory(), Memory(FOLLOW, 0), Memory(FOLLOW, 7)):
+        words.append(scene_of(user, state=START._replace(s=51.0, ds=10.0), memory=memory)[1].goal)
+    assert words == [KEEP, FOLLOW, KEEP]
 
 
 def test_scenes_do_not_pass_lines_without_permission() -> None:

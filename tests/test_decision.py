@@ -127,6 +127,13 @@ def test_a_crosswalk_belongs_to_who_walks(user: User, expected: bool) -> None:
     assert ("here" in found.granted) is expected, found.reasons
 
 
+def test_who_walks_gets_a_margin_too() -> None:
+    """In the zone after 5 s, when we have left it for .5 s."""
+    walks = [User(100.0, 3.3 + 1.4 * 5.0, -NORTH, 1.4, "pedestrian")]
+    told = [may("crosswalk", AT_LINE, 0.0, walks, rules=Rules(margin=m, spread=0.01)) for m in (0.2, 1.0)]
+    assert told == [True, False]
+
+
 def test_at_a_stop_sign_one_stands_once_and_then_gives_way() -> None:
     coming = [User(100.0, -20.0, NORTH, 10.0)]
     moving = decided("stop", AT_LINE - 5.0, 4.0, [])

@@ -111,6 +111,15 @@ def test_covariances_grow_by_the_formula() -> None:
     np.testing.assert_allclose(S[:, 0, 1], 0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("user", [User(100.0, 0.3, 0.3, 8.0), User(100.0, 30.0, 0.3, 8.0, "pedestrian")])
+def test_what_is_uncertain_now_is_what_the_tracker_says(user: User) -> None:
+    S = np.array([[0.4, 0.1], [0.1, 0.2]])
+    found = predict(ROADS, tracks([user])._replace(covariance=S[None]), [1e-6])
+    np.testing.assert_allclose(
+        found.obstacles.covariance, np.broadcast_to(S, found.obstacles.covariance.shape), atol=1e-5
+    )
+
+
 def test_covariances_turn_with_the_lane() -> None:
     """A quarter turn: what was uncertain ahead is uncertain to the north."""
     lanes = network({1: arc(0.0, 20.0, 20.0, -math.pi / 2, math.pi / 2, successors=(2,)), 2: straight(20, 20, 20, 120)})

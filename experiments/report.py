@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 UNITS = {
     "m": "m", "cm": "cm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms", "us": "us", "mps": "m/s",
-    "sd": "sd", "nats": "nats", "pct": "%", "hz": "Hz",
+    "mps2": "m/s²", "mps3": "m/s³", "sd": "sd", "nats": "nats", "pct": "%", "hz": "Hz",
 }  # fmt: skip
 
 LISTED = 100  # values of a list that are all told
@@ -63,7 +63,7 @@ def write_report(
     body = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="sub">scene {escape(result.scene.name)} &middot; {escape(manifest["date"])}</p>',
-        _failures(failures),
+        failure_boxes(failures),
         _flags(result.flags),
         "".join(
             f"<h2>{escape(title)}</h2>{table(tuple(map(head, rows[0])), [tuple(row.values()) for row in rows])}"
@@ -71,7 +71,7 @@ def write_report(
             if rows
         ),
         "<h2>Scores</h2>",
-        _scores(result.scores, manifest["config"].get("metrics", [])) if result.scores else unscored,
+        scores_table(result.scores, manifest["config"].get("metrics", [])) if result.scores else unscored,
         "".join(f"<h2>{_words(name)}</h2>{image}" for name, image in images.items()),
         "<h2>Convergence</h2>",
         _by_name(_labelled(result.posterior, result.diagnostics)),
@@ -106,7 +106,7 @@ def save_figures(folder: Path, figures: dict[str, Any]) -> tuple[dict[str, str],
     return images, failures
 
 
-def _failures(failures: dict[str, Exception]) -> str:
+def failure_boxes(failures: dict[str, Exception]) -> str:
     """What is missing from the page, and why."""
     boxes = []
     for what, error in failures.items():
@@ -116,7 +116,8 @@ def _failures(failures: dict[str, Exception]) -> str:
     return "".join(boxes)
 
 
-def _scores(scores: dict[str, float], metrics: list[dict[str, Any]]) -> str:
+def scores_table(scores: dict[str, float], metrics: list[dict[str, Any]]) -> str:
+    """Scores with what the modules of their metrics, targets of a config, say of them."""
     says = meanings(scores, (metric["_target_"].rpartition(".")[0] for metric in metrics))
     rows = [(label, scores[name], unit, says.get(name, "")) for name in scores for label, unit in [split_unit(name)]]
     return table(("metric", "value", "unit", "meaning"), rows)

@@ -108,6 +108,7 @@ def run(
 
     with stage("scenario"):
         scene = scenario()
+        check_read(scene)
     say(f"scenario   {scene.name}")
     with stage("prepare"), announce("compiling the model", after=4.0):
         evidence = evidence_of(model, scene)
@@ -146,6 +147,16 @@ def evidence_of(model: Any, scene: Scene) -> Any:
     evidence = model.prepare(scene.data) if hasattr(model, "prepare") else scene.data
     check(model, evidence)
     return evidence
+
+
+def check_read(scene: Scene) -> None:
+    """Raise InputError for a scene without data."""
+    from models.program import InputError
+
+    if not hasattr(scene, "data"):
+        raise InputError(
+            f"scenario {scene.name} is one to drive in, not to learn from; `python -m experiments.drive` drives it"
+        )
 
 
 def _infer(engine: Engine, model: Any, evidence: Any, seed: int) -> Posterior:
@@ -227,20 +238,20 @@ def job_of(config: DictConfig, choices: dict[str, str]) -> Job:
 
     Raises where a value cannot be resolved, ConfigError for seeds and lists that no run can take."""
     settings = plain(config)
-    _check(settings)
+    check_settings(settings, SETTINGS, LISTS)
     root, force = Path(settings.pop("runs")), settings.pop("force")
     title = "-".join(str(choices[part]) for part in ("scenario", "model", "engine"))
     return Job(settings, root / f"{title}-{store.identity(settings)}", force)
 
 
-def _check(settings: dict[str, Any]) -> None:
-    """Raise ConfigError for what would fail late, when the engine has worked for nothing, or be read by nobody."""
-    if unknown := sorted(settings.keys() - SETTINGS):
-        raise ConfigError(f"no setting is called '{unknown[0]}'; there are {', '.join(sorted(SETTINGS))}")
+def check_settings(settings: dict[str, Any], known: set[str], lists: Iterable[str]) -> None:
+    """Raise ConfigError for what would fail late, when all has worked for nothing, or be read by nobody."""
+    if unknown := sorted(settings.keys() - known):
+        raise ConfigError(f"no setting is called '{unknown[0]}'; there are {', '.join(sorted(known))}")
     for name, seed in (("seed", settings["seed"]), ("scenario.seed", settings["scenario"].get("seed"))):
         if isinstance(seed, int) and seed < 0:
             raise ConfigError(f"{name} is {seed}; choose 0 or more")
-    for name in LISTS:
+    for name in lists:
         value = settings[name]
         if not isinstance(value, list) or not all(isinstance(v, dict) and v.get("_partial_") for v in value):
             raise ConfigError(

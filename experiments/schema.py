@@ -21,8 +21,8 @@ from omegaconf import MISSING, BooleanNode, Container, DictConfig, IntegerNode, 
 
 from experiments.signatures import ConfigError, Knob, knobs, locate
 
-SUPPLIED = frozenset(  # by run(), to partial targets
-    {"model", "evidence", "scans", "scene", "posterior", "posteriors", "seed"}
+SUPPLIED = frozenset(  # by run() and drive(), to partial targets
+    {"model", "evidence", "scans", "scene", "posterior", "posteriors", "seed", "drive", "route", "planner"}
 )
 
 

@@ -63,8 +63,8 @@ def knobs(target: str) -> dict[str, Knob]:
     arguments = _fields(home, node) if isinstance(node, ast.ClassDef) else _parameters(home, node)
     result = {}
     for argument, annotation, default in arguments:
-        value, readable = MISSING, default is None
-        if default is not None:
+        value, readable = MISSING, default is None or _is_made(home, default)
+        if not readable and default is not None:
             value, readable = _constant(home, default)
         if not readable:
             return _imported_knobs(target)
@@ -137,6 +137,17 @@ def _constant(module: str, node: ast.expr) -> tuple[Any, bool]:
     except Exception:
         return None, False
     return (value, True) if _is_plain(value) else (None, False)
+
+
+def _is_made(module: str, default: ast.expr) -> bool:
+    """Whether a default is an object of a class, `Limits()` or `field(default_factory=Limits)`: no config shows it."""
+    if isinstance(default, ast.Call) and isinstance(default.func, ast.Name) and default.func.id == "field":
+        factory = next((word.value for word in default.keywords if word.arg == "default_factory"), None)
+        default = factory.body if isinstance(factory, ast.Lambda) else ast.Call(factory, [], []) if factory else default
+    if not isinstance(default, ast.Call) or not isinstance(default.func, ast.Name):
+        return False
+    found = _find(module, default.func.id)
+    return found is not None and isinstance(found[1], ast.ClassDef)
 
 
 def _is_plain(value: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,15 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import MISSING, OmegaConf
 
 import experiments.command  # noqa: F401  (installs the schemas)
+from experiments.closed_loop import Loop
 from experiments.command import in_words, plain
+from experiments.scenarios.driving import DriveScene
 from experiments.schema import build, check_values, expand
 from experiments.signatures import ConfigError, knobs, locate
+from planning.behaviour import Manners
+from planning.decision import Rules
+from planning.planner import Planner
+from planning.situation import Situation
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 OPTIONS = [
@@ -32,15 +39,31 @@ def hydra_context() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize(("group", "name"), OPTIONS)
+@pytest.mark.parametrize(("group", "name"), [option for option in OPTIONS if option[0] != "planner"])
 def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: str) -> None:
     config = plain(compose("run", [f"{group}={name}"]))
+    check_targets(config)
+    build(config["model"], "model")
+    build({key: config[key] for key in ("engine", "functionals", "metrics", "figures")})
+
+
+@pytest.mark.parametrize(
+    ("group", "name"), [(g, n) for g, n in OPTIONS if g == "planner" or (g == "scenario" and n.startswith("drive_"))]
+)
+def test_every_config_of_a_drive_composes_and_builds_what_the_code_has_as_defaults(group: str, name: str) -> None:
+    config = plain(compose("drive", [f"{group}={name}"]))
+    check_targets(config)
+    parts = build({key: config[key] for key in ("scenario", "driver", "planner", "loop", "metrics", "figures")})
+    assert isinstance(parts["scenario"], DriveScene)
+    assert (parts["planner"], parts["loop"]) == (Planner(), Loop())
+    assert parts["driver"].keywords == {"situation": Situation(), "rules": Rules(), "manners": Manners()}
+
+
+def check_targets(config: Any) -> None:
     for target in targets_of(config):
         function = locate(target["_target_"])
         keys = {key: 0 for key in target if not key.startswith("_")}
         inspect.signature(function).bind_partial(**keys)  # raises TypeError for a key it does not take
-    build(config["model"], "model")
-    build({key: config[key] for key in ("engine", "functionals", "metrics", "figures")})
 
 
 def targets_of(node: Any) -> Iterator[dict[str, Any]]:
@@ -100,6 +123,8 @@ class Model(Base):
     colour: Literal["red", "green"] = "red"
     limit: int | None = None
     inner: Base = Base()
+    made: Base = field(default_factory=Base)
+    other: Base = field(default_factory=lambda: Base(width=3.0))
 """
 
 
@@ -116,9 +141,11 @@ def test_a_signature_outside_the_tree_is_read_with_its_base_class(package: str) 
     read = knobs(f"{package}.Model")
     assert {name: knob.default for name, knob in read.items()} == {
         "width": 2.0, "needed": 0, "angle": 1.5707963267948966, "pair": (1.0, 2.0),
-        "colour": "red", "limit": None, "inner": MISSING,
+        "colour": "red", "limit": None, "inner": MISSING, "made": MISSING, "other": MISSING,
     }  # fmt: skip
     assert read["colour"].choices == ("red", "green")
+    assert not any(knob.required for knob in read.values())
+    assert package not in sys.modules, "it is read without an import"
 
 
 def test_a_tuple_stays_a_tuple_and_an_unshown_default_stays_the_targets_own(package: str) -> None:

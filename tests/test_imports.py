@@ -55,14 +55,15 @@ HEAVY = ("torch", "pyro", "numba", "arviz", "matplotlib", "scipy")
 
 
 @pytest.mark.parametrize("words", [["--cfg", "job"], ["--help"]])
-def test_help_and_dry_run_import_nothing_heavy(words: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("module", "knob"), [("run", "num_steps"), ("drive", "headway")])
+def test_help_and_dry_run_import_nothing_heavy(module: str, knob: str, words: list[str], tmp_path: Path) -> None:
     code = (
-        "import sys\nfrom experiments.run import main\n"
+        f"import sys\nfrom experiments.{module} import main\n"
         "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
         f"print('HEAVY', [name for name in {HEAVY} if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True)
-    assert "num_steps" in done.stdout, done.stderr
+    assert knob in done.stdout, done.stderr
     assert done.stdout.rstrip().endswith("HEAVY []")
     assert not list(tmp_path.iterdir()), "a dry run writes nothing"
 

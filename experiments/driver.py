@@ -1,0 +1,47 @@
+"""Who drives by the rules: situation analysis, decisions and behaviour in turn, with what they remember."""
+
+from __future__ import annotations
+
+from experiments.closed_loop import Mind, Thought
+from experiments.scenarios.driving import DriveScene
+from planning.behaviour import Manners, Memory, behave
+from planning.decision import Decided, Rules, decide
+from planning.frenet import FrenetState
+from planning.planner import Planner
+from planning.road import Route, Tracks
+from planning.shapes import boundary
+from planning.situation import Situation, along, network, predict
+
+
+def by_the_rules(
+    scene: DriveScene,
+    route: Route,
+    planner: Planner,
+    *,
+    situation: Situation = Situation(),
+    rules: Rules = Rules(),
+    manners: Manners = Manners(),
+) -> Mind:
+    """A mind for one drive (experiments.closed_loop.drive); boundary lines of the scene are seen from the beginning."""
+    roads = network(scene.lanes)
+    times = [planner.step * (k + 1) for k in range(planner.num_steps)]
+    decided, behaved = Decided(), Memory()
+
+    def think(now: float, state: FrenetState, tracks: Tracks) -> Thought:
+        nonlocal decided, behaved
+        predictions = predict(roads, tracks, times, situation)
+        places = along(route, predictions)
+        lights = scene.lights_at(now)
+        permissions = decide(
+            route, state, planner.vehicle, predictions, scene.stops, lights, decided, rules, places=places
+        )
+        given, behaved = behave(
+            planner, route, state, predictions, scene.stops, permissions, behaved, manners, places=places
+        )
+        decided = permissions.memory
+        if scene.boundary:
+            lines = [*given.boundary.segment.reshape(-1, 2, 2), *scene.boundary]
+            given = given._replace(boundary=boundary(lines, planner.radius))
+        return Thought(given, "; ".join([behaved.goal, *(f"{k}: {why}" for k, why in permissions.reasons.items())]))
+
+    return think

@@ -9,7 +9,6 @@ from planning.decision import Decided, Rules, decide
 from planning.frenet import FrenetState
 from planning.planner import Planner
 from planning.road import Route, Tracks
-from planning.shapes import boundary
 from planning.situation import Situation, along, network, predict
 
 
@@ -36,12 +35,18 @@ def by_the_rules(
             route, state, planner.vehicle, predictions, scene.stops, lights, decided, rules, places=places
         )
         given, behaved = behave(
-            planner, route, state, predictions, scene.stops, permissions, behaved, manners, places=places
+            planner,
+            route,
+            state,
+            predictions,
+            scene.stops,
+            permissions,
+            behaved,
+            manners,
+            places=places,
+            lines=scene.boundary,
         )
         decided = permissions.memory
-        if scene.boundary:
-            lines = [*given.boundary.segment.reshape(-1, 2, 2), *scene.boundary]
-            given = given._replace(boundary=boundary(lines, planner.radius))
         return Thought(given, "; ".join([behaved.goal, *(f"{k}: {why}" for k, why in permissions.reasons.items())]))
 
     return think

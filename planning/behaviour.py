@@ -92,10 +92,12 @@ def behave(
     manners: Manners = Manners(),
     *,
     places: Along | None = None,
+    lines: Sequence[Floats] = (),
 ) -> tuple[Scene, Memory]:
     """The scene of a cycle (for planning.planner.plan), and what to remember for the next.
 
-    state   on route.line; places  of the predictions along the route, where they are at hand"""
+    state   on route.line; places  of the predictions along the route, where they are at hand
+    lines   seen in the world, that must not be touched, besides the borders of what may be driven"""
     told = along(route, predictions) if places is None else places
     vehicle, front = planner.vehicle, state.s + planner.vehicle.front
     line = barrier(route, stop_points, permissions, front)
@@ -122,7 +124,7 @@ def behave(
         goal,
         offsets_about(wanted, low, high, manners),
         wanted,
-        borders(planner, route, state, around),
+        borders(planner, route, state, around, lines),
         predictions.obstacles,
         max(line, front),
         line if lead is None else min(line, lead.stands(planner)),
@@ -245,9 +247,11 @@ def left_lanes(planner: Planner, route: Route, state: FrenetState, around: Passi
     return sides
 
 
-def borders(planner: Planner, route: Route, state: FrenetState, around: Passing) -> Boundary:
-    """Near the vehicle; where a lane is left at a side, the far border of the lane beside it instead."""
-    sides, lines = left_lanes(planner, route, state, around), []
+def borders(
+    planner: Planner, route: Route, state: FrenetState, around: Passing, seen: Sequence[Floats] = ()
+) -> Boundary:
+    """Lines near the vehicle: `seen`, and borders; where a lane is left, the far one of the lane beside it."""
+    sides, lines = left_lanes(planner, route, state, around), list(seen)
     for n in range(len(route.lanes)):
         for side in (LEFT, RIGHT):
             far = route.outer[n][side]

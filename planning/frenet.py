@@ -6,13 +6,19 @@ The reference point is the middle of the rear axle, whose path has the vehicle's
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from models.program import InputError
-from planning.kinematics import NARROWEST
+from planning.kinematics import KINEMATICS, NARROWEST
+from planning.polynomials import NOTHING
 from planning.reference import ReferenceLine
 from planning.reference_kernel import BEYOND_ENDS, FOUND
 
+Floats = NDArray[np.float64]
 STEEPEST = math.radians(75)  # between the vehicle and the line: beyond it, arc length hardly grows with the way
 
 
@@ -79,15 +85,17 @@ def to_frenet(line: ReferenceLine, pose: Pose, start: float | None = None) -> Fr
 
 
 def to_pose(line: ReferenceLine, state: FrenetState) -> Pose:
-    """Where the vehicle is and how it moves there.
+    """Where the vehicle is and how it moves there."""
+    return Pose(*to_poses(line, [state])[0].tolist())
+
+
+def to_poses(line: ReferenceLine, states: Sequence[FrenetState]) -> Floats:
+    """Poses (K, 6) of K states.
 
     With s' = 1 and s'' = 0 the kinematics tell n = ds_path/ds, dn/ds and the curvature; v = n s'."""
-    from planning.kinematics import KINEMATICS
-    from planning.polynomials import NOTHING
-
-    _, _, theta, kappa, rate = map(float, line.at(state.s))
-    shape = KINEMATICS([[1.0, 0.0, kappa, rate, state.d, state.slope, state.bend]], NOTHING)[0]
-    n, stretching, curvature, w = map(float, shape)
-    x, y = map(float, line.place(state.s, state.d))
-    heading = theta + math.atan2(state.slope, w)
-    return Pose(x, y, heading, n * state.ds, n * state.dds + stretching * state.ds**2, curvature)
+    s, ds, dds, d, slope, bend = np.array(states, float).T
+    _, _, theta, kappa, rate = line.at(s).T
+    one = np.ones_like(s)
+    n, stretching, curvature, w = KINEMATICS(np.stack([one, 0 * one, kappa, rate, d, slope, bend], -1), NOTHING).T
+    x, y = line.place(s, d).T
+    return np.stack([x, y, theta + np.arctan2(slope, w), n * ds, n * dds + stretching * ds**2, curvature], -1)

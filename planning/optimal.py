@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from planning import optimal_problem as problem
 from planning.candidates import Keep, Reach, Weights
 from planning.corridor import corridor
-from planning.frenet import FrenetState, to_pose
+from planning.frenet import FrenetState, to_pose, to_poses
 from planning.kinematics import LIMITS, PLACED
 from planning.optimal_problem import ACROSS, CURVATURE, PLACE, TO_PLACE, TO_SPEED, Shape
 from planning.planner import (
@@ -144,7 +144,7 @@ class Refined(NamedTuple):
 
     def trajectory(self, t: list[float] | Floats) -> Floats:
         """x, y, heading, speed, acceleration, curvature (K, 6) at times t after the start."""
-        return np.array([to_pose(self.plan.line, state) for state in self.states(t)])
+        return to_poses(self.plan.line, self.states(t))
 
 
 def refine(

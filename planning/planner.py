@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from models.program import InputError
 from planning import candidates
 from planning.candidates import Fans, Goal, Keep, Lateral, Longitudinal, Weights
-from planning.frenet import FrenetState, to_pose
+from planning.frenet import FrenetState, to_pose, to_poses
 from planning.kinematics import LIMITS, Limits
 from planning.polynomials import Polynomials, quartics
 from planning.reference import ReferenceLine
@@ -148,7 +148,7 @@ class Plan(NamedTuple):
 
     def trajectory(self, t: Sequence[float] | Floats) -> Floats:
         """x, y, heading, speed, acceleration, curvature (K, 6) at times t after the start."""
-        return np.array([to_pose(self.line, state) for state in self.states(t)])
+        return to_poses(self.line, self.states(t))
 
 
 def forwards(along: Floats) -> Floats:

@@ -9,15 +9,17 @@ from typing import Any
 from inference.posterior import Posterior
 
 
-def made(words: list[str], *groups: str) -> tuple[Any, ...]:
-    """What these groups of the config make that the words compose: models, engines that wait for their arguments."""
+def made(words: list[str], *groups: str, root: str = "run") -> tuple[Any, ...]:
+    """What these groups of the config make that the words compose: models, engines that wait for their arguments.
+
+    root  the config that the words are for: of experiments.run or experiments.drive"""
     from hydra import compose, initialize_config_module
     from omegaconf import OmegaConf
 
     from experiments.schema import build
 
     with initialize_config_module("configs", version_base="1.3"):
-        config = compose("run", words)
+        config = compose(root, words)
     return tuple(build(OmegaConf.to_container(config[group], resolve=True), group) for group in groups)
 
 

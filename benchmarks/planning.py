@@ -19,7 +19,7 @@ from benchmarks import figure as fig
 if TYPE_CHECKING:
     from benchmarks.planning_scene import Effort
 
-PARTS = ("planning_speed", "planning_peers", "planning_optimal", "planning_repeat")
+PARTS = ("planning_speed", "planning_peers", "planning_optimal", "planning_repeat", "planning_drives")
 
 
 def measurements() -> tuple[fig.Measurement, ...]:

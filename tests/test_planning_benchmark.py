@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks import planning
+from benchmarks import planning, planning_drives
 from benchmarks.plain_margins import margins
 from benchmarks.planning_scene import PLANNER, WIDE, Effort, fan, scene
 from benchmarks.timing import THREADS
@@ -30,13 +30,22 @@ PROMISED = {
     "ocp_ms_p95": "<= 15",
     "ocp_solved": ">= 1",
     "ocp_cost_ratio": "<= 1",
+    "collisions_at_fault": "<= 0",
+    "collisions": "",
+    "limit_violations": "<= 0",
+    "stops_passed": "<= 0",
+    "stop_error_m": "<= 0.15",
+    "gap_error_m": "<= 0.3",
+    "emergency_share": "",
+    "cycle_ms": "",
     "consistency_p95_m": "<= 1e-09",
     "consistency_noisy_lead_m": "",
     "chance_stated": "",
     "chance_rate": "",
     "chance_ratio": "<= 1.2",
 }
-OURS = [key for key in PROMISED if not key.startswith("ratio")]
+DRIVES = [figure.key for figure in planning_drives.MEASUREMENTS[0].figures]
+OURS = [key for key in PROMISED if not key.startswith("ratio") and key not in DRIVES]
 
 
 @pytest.fixture(autouse=True)
@@ -74,3 +83,23 @@ def test_timed_candidates_are_all_judged_and_wide_limits_turn_none_down() -> Non
     assert (everything.reason >= 0).all() and 0 < (everything.reason == 0).sum() < 3000
     empty = given._replace(boundary=boundary([], PLANNER.radius), obstacles=no_obstacles(PLANNER.num_steps))
     assert (judge(PLANNER, empty, fan(PLANNER, 3000), WIDE, first_good=False).reason == 0).all()
+
+
+def test_drives_are_counted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = dict.fromkeys(("collisions_at_fault", "stops_passed"), 0.0) | {"collisions": 1.0, "limit_violations": 3.0}
+    one |= {"emergency": 0.5, "cycle_median_ms": 8.0, "cycles": 10.0, "stop_error_m": 0.1}
+    other = one | {"collisions_at_fault": 2.0, "emergency": 0.0, "cycles": 30.0, "stop_error_m": 0.05}
+    monkeypatch.setattr(planning_drives, "scores", lambda effort: {"follow": one, "recorded": other})
+    found = planning_drives.closed_loops(TINY)
+    told = {key: found[key].value for key in found}
+    assert told == {
+        "collisions_at_fault": 2.0, "collisions": 2.0, "limit_violations": 6.0, "stops_passed": 0.0,
+        "stop_error_m": 0.1, "gap_error_m": None, "emergency_share": 0.125, "cycle_ms": 8.0,
+    }  # fmt: skip
+    assert "recorded 2" in found["collisions_at_fault"].detail and "follow" in found["stop_error_m"].detail
+
+
+def test_every_simulated_scenario_is_driven() -> None:
+    files = {path.stem for path in (planning_drives.ROOT / "configs" / "scenario").glob("drive_*.yaml")}
+    assert files - {"drive_commonroad"} == {f"drive_{name}" for name in planning_drives.SIMULATED}
+    assert list(planning_drives.drives(Effort(scenes=10**6, repeats=1)))[:7] == list(planning_drives.SIMULATED)

@@ -34,7 +34,7 @@ from inference.lmb_kernel import survive
 from inference.lmb_particles_kernel import update
 from inference.object_particles import draw, draw_prior, log_corrections, moments, widen
 from inference.refusal import answers_first
-from inference.tracking import Facts, require_objects, track
+from inference.tracking import MEMORY, Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, View
 from models.program import InputError
@@ -65,7 +65,7 @@ class Belief(NamedTuple):
     """T objects of N particles each at a time [s], None before the first scan.
 
     label (T,), existence (T,), weight (T, N) summing to one by object, kind (T, N), state (T, N, n), and family (T, N):
-    in which component of the newcomers a particle began
+    in which component of the newcomers a particle began. past: the latest scans, by time
     """
 
     time: float | None
@@ -75,6 +75,7 @@ class Belief(NamedTuple):
     kind: Ints
     state: Floats
     family: Ints
+    past: tuple[Timed, ...] = ()
 
     @property
     def offset(self) -> Ints:
@@ -91,7 +92,7 @@ class Belief(NamedTuple):
 
     def only(self, rows: Any) -> Belief:
         """Some of the objects."""
-        return Belief(self.time, *(value[rows] for value in self[1:]))
+        return Belief(self.time, *(value[rows] for value in self[1:-1]), self.past)
 
 
 def nobody(size: int, num_particles: int) -> Belief:
@@ -103,7 +104,7 @@ def nobody(size: int, num_particles: int) -> Belief:
 
 def together(a: Belief, b: Belief) -> Belief:
     """The objects of both, at the time of the first."""
-    return Belief(a.time, *(np.concatenate(pair) for pair in zip(a[1:], b[1:], strict=True)))
+    return Belief(a.time, *(np.concatenate(pair) for pair in zip(a[1:-1], b[1:-1], strict=True)), a.past)
 
 
 def predict(
@@ -125,7 +126,7 @@ def predict(
     label, parts = number * STRIDE + STRIDE // 2 + np.arange(len(arrived.label)), arrived.components
     component = components_of(parts.offset, parts.weight, range(len(label)), num, rng)
     state = draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size)))
-    even = np.full((len(label), num), 1.0 / num)
+    even = np.full((len(label), num), 1.0 / max(num, 1))
     kind, state = parts.kind[component].reshape(-1, num), state.reshape(-1, num, size)
     family = component.reshape(-1, num) - parts.offset[:-1, None]
     covariance = np.concatenate([covariance, np.zeros((len(component), size, size))])
@@ -208,7 +209,7 @@ def look(model: HasObjects, scan: Timed, objects: Bernoullis, kind: Ints, state:
     one = np.arange(len(best) + 1)
     few = Components(one, np.ones(len(best)), parts.kind[best], parts.mean[best], parts.covariance[best])
     flat = np.broadcast_to(np.zeros((state.shape[1], state.shape[1])), (num, state.shape[1], state.shape[1]))
-    more = Components(np.array([0, num]), np.full(num, 1.0 / num), kind, state, flat)
+    more = Components(np.array([0, num]), np.full(num, 1.0 / max(num, 1)), kind, state, flat)
     view = model.view(scan, objects._replace(components=few), more)
     return view.predicted[len(best) :], view.detection[len(best) :]
 
@@ -219,7 +220,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     rng, num = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))), knobs.num_particles
     seconds = 0.0 if belief.time is None else scan.time - belief.time
     belief, covariance = predict(model, belief, seconds, number, rng)
-    objects, unseen = regularise(belief, covariance, model.period, knobs.kernel), model.unseen(scan)
+    objects, unseen = regularise(belief, covariance, model.period, knobs.kernel), model.unseen(scan, belief.past)
     view, old = model.view(scan, objects, unseen), belief.weight.size
     existence, uniform = objects.existence.copy(), rng.random(len(belief.label))
     component, chosen, first, mass, (log_factor, loopy) = update(
@@ -246,6 +247,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
         parts.kind[whose].reshape(-1, num),
         state.reshape(-1, num, state.shape[1]),
         family[whose].reshape(-1, num),
+        (*belief.past[1 - MEMORY :], scan),
     )
     return posterior, Facts(log_factor, int(loopy), float(left_out))
 

@@ -25,7 +25,7 @@ from inference import lmb
 from inference.association import MISSED, Table, best
 from inference.lmb_kernel import heaviest
 from inference.refusal import answers_first
-from inference.tracking import Facts, require_objects, track
+from inference.tracking import MEMORY, Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, no_objects
 from models.program import InputError
@@ -63,6 +63,7 @@ class Belief(NamedTuple):
     vain     (T,) of these, those since the last measurement
     last     (T,) time of the last measurement [s]
     sure     (T,) whether it is confirmed
+    past     the latest scans, by time
     """
 
     time: float | None
@@ -72,6 +73,7 @@ class Belief(NamedTuple):
     vain: Ints
     last: Floats
     sure: NDArray[np.bool_]
+    past: tuple[Timed, ...] = ()
 
 
 class Fit(NamedTuple):
@@ -113,7 +115,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     """Predict to the scan, associate, update, begin and end. The scan must not be older than the belief."""
     belief = predict(model, belief, scan.time, number)
     objects, (label, existence, components) = belief.objects, belief.objects
-    unseen = model.unseen(scan)
+    unseen = model.unseen(scan, belief.past)
     view = model.view(scan, objects, unseen)
     num, count = len(view.values), len(components.weight)
     known, new = fit(components, view, slice(count), knobs.gate), fit(unseen, view, slice(count, None), np.inf)
@@ -146,7 +148,8 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     )
     hits, looks, vain = (np.append(a[keep], b) for a, b in ((hits, ones), (looks, ones), (vain, 0 * ones)))
     last, sure = np.append(last[keep], scan.time * ones), np.append(sure[keep], ones * knobs.hits <= 1)
-    return Belief(scan.time, after, hits, looks, vain, last, sure), Facts(log_factor)
+    past = (*belief.past[1 - MEMORY :], scan)
+    return Belief(scan.time, after, hits, looks, vain, last, sure, past), Facts(log_factor)
 
 
 def predict(model: HasObjects, belief: Belief, now: float, number: int) -> Belief:
@@ -159,7 +162,7 @@ def predict(model: HasObjects, belief: Belief, now: float, number: int) -> Belie
     more = len(moved.label) - num
     hits, looks, vain = (np.append(values, np.zeros(more, dtype=np.int64)) for values in belief[2:5])
     last, sure = np.append(belief.last, np.full(more, now)), np.append(belief.sure, np.zeros(more, dtype=bool))
-    return Belief(now, moved._replace(existence=existence), hits, looks, vain, last, sure)
+    return Belief(now, moved._replace(existence=existence), hits, looks, vain, last, sure, belief.past)
 
 
 def summed(components: Components, values: Floats) -> Floats:

@@ -126,7 +126,7 @@ def predict(
     label, parts = number * STRIDE + STRIDE // 2 + np.arange(len(arrived.label)), arrived.components
     component = components_of(parts.offset, parts.weight, range(len(label)), num, rng)
     state = draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size)))
-    even = np.full((len(label), num), 1.0 / max(num, 1))
+    even = np.full((len(label), num), 1.0 / num)
     kind, state = parts.kind[component].reshape(-1, num), state.reshape(-1, num, size)
     family = component.reshape(-1, num) - parts.offset[:-1, None]
     covariance = np.concatenate([covariance, np.zeros((len(component), size, size))])

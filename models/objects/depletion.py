@@ -7,7 +7,8 @@ They are a Poisson process (Williams 2015). Of kind k, from its density u_0 wher
 
 so that at a scan at t_0, after looks at t_1 >= t_2 ... with detection probabilities p_1, p_2, ...
 
-    u / u_0 = sum_i (1 - s_i) prod_{j < i} s_j (1 - p_j) + prod_i s_i (1 - p_i),   s_i = exp((t_i - t_{i-1}) / lifetime_k)
+    u / u_0 = sum_i (1 - s_i) prod_{j < i} s_j (1 - p_j) + prod_i s_i (1 - p_i),
+    s_i = exp((t_i - t_{i-1}) / lifetime_k)
 
 A few looks settle it wherever one sees well, so that it is computed where it is asked for and no map is kept.
 

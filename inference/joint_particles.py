@@ -113,7 +113,7 @@ def predict(
         component - parts.offset[which],
     )
     joined = (np.concatenate(pair) for pair in zip(belief[2:-1], fresh, strict=True))
-    belief = Belief(belief.time, belief.log_weight, *joined, belief.past)
+    belief = Belief(*(belief.time, belief.log_weight, *joined, belief.past))
     none = np.zeros((len(component), size, size))
     return belief, np.concatenate([survival, np.ones(len(component))]), np.concatenate([covariance, none])
 

@@ -92,7 +92,7 @@ class Belief(NamedTuple):
 
     def only(self, rows: Any) -> Belief:
         """Some of the objects."""
-        return Belief(self.time, *(value[rows] for value in self[1:-1]), self.past)
+        return Belief(self.time, *(value[rows] for value in self[1:-1]))._replace(past=self.past)
 
 
 def nobody(size: int, num_particles: int) -> Belief:
@@ -104,7 +104,8 @@ def nobody(size: int, num_particles: int) -> Belief:
 
 def together(a: Belief, b: Belief) -> Belief:
     """The objects of both, at the time of the first."""
-    return Belief(a.time, *(np.concatenate(pair) for pair in zip(a[1:-1], b[1:-1], strict=True)), a.past)
+    joined = [np.concatenate(pair) for pair in zip(a[1:-1], b[1:-1], strict=True)]
+    return Belief(*(a.time, *joined, a.past))
 
 
 def predict(

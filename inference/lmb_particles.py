@@ -105,7 +105,7 @@ def nobody(size: int, num_particles: int) -> Belief:
 def together(a: Belief, b: Belief) -> Belief:
     """The objects of both, at the time of the first."""
     joined = (np.concatenate(pair) for pair in zip(a[1:-1], b[1:-1], strict=True))
-    return a._replace(**dict(zip(Belief._fields[1:-1], joined, strict=True)))
+    return a._replace(**dict(zip(Belief._fields[1:-1], joined, strict=True)))  # type: ignore[arg-type]
 
 
 def predict(

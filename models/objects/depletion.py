@@ -22,39 +22,82 @@ Each of these only makes u greater, or is too little to matter:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from models.objects.scans import Scan
-from models.objects.sensors import mounted
 
 if TYPE_CHECKING:
     from models.objects.traffic import Traffic
 
 Floats = NDArray[np.float64]
 LEAST = 1e-3  # of what was there before a look: where later looks have left less of it, looks before are not counted
+FEW = 3  # looks that settle it nearly everywhere: more are taken up only where they do not
 
 
-def left_over(model: Traffic, scan: Scan, past: Sequence[Scan], state: Floats) -> Floats:
-    """(M, C) u / u_0 of each kind at the places of states (M, n) that a scan shows, after the scans `past`, by time."""
-    sensor, num = model.sensor(scan), len(state)
-    share, left, rows = np.zeros((num, len(model.kinds))), np.ones((num, len(model.kinds))), np.arange(num)
-    detect, time = model.formulas(sensor)[1], scan.time
-    settings = np.array([(0.0, 0.0, 0.0, *sensor.settings, sensor.occlusion)])
-    for look in reversed(past):
-        if look.sensor != sensor.name:
-            continue
-        settings[0, :3] = mounted(look.pose, sensor.mount)
-        stay = np.exp((look.time - time) / model.lifetime)
-        share[rows] += left * (1.0 - stay)
-        left = left * stay * (1.0 - detect(state, settings) * model.visibility)
-        time, more = look.time, left.max(1) > LEAST
-        if not more.all():  # looks before these change nothing there
-            rows, left, state = rows[more], left[more], state[more]
-        if not len(rows):
+def left_over(model: Traffic, scan: Scan, past: Sequence[Scan], position: Floats) -> Floats:
+    """(M, C) u / u_0 of each kind at positions (M, 2) that a scan shows, after the scans `past`, by time."""
+    sensor, shape, time = model.sensor(scan), (len(position), len(model.kinds)), scan.time
+    share, left, rows = np.zeros(shape), np.ones(shape), np.arange(len(position))
+    detect = model.formulas(sensor)[1].compiled(jacobian=False)
+    looks = (look for look in reversed(past) if look.sensor == sensor.name)
+    for count in (FEW, None):
+        some = list(islice(looks, count))
+        if not some or not len(rows):
             break
-    share[rows] += left
+        pose, times = np.concatenate([look.pose for look in some]), np.array([look.time for look in some])
+        states, settings, detection = laid_out(rows, position, pose, sensor.looking, len(model.names))
+        detect(states, settings, detection)
+        rows = count_looks(rows, detection, time, times, model.lifetime, model.visibility, share, left)
+        time = some[-1].time
+    share[rows] += left[rows]
     return share
+
+
+@njit(cache=True, error_model="numpy")
+def laid_out(rows, position, pose, looking, size):  # type: ignore[no-untyped-def]
+    """What p_D reads: states (R L, n) at some of the positions, at rest, for each of L poses (3 L,) of the car, and
+    settings (R L, .) of the sensor there; and where to put it (R L, 1)."""
+    R, L, own = len(rows), len(pose) // 3, len(looking)
+    states, settings = np.zeros((R * L, size)), np.empty((R * L, own))
+    for k in range(L):
+        x, y, heading = pose[3 * k], pose[3 * k + 1], pose[3 * k + 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        x, y = x + cos * looking[0] - sin * looking[1], y + sin * looking[0] + cos * looking[1]
+        for r in range(R):
+            at = r * L + k
+            states[at, 0], states[at, 1] = position[rows[r], 0], position[rows[r], 1]
+            settings[at, 0], settings[at, 1], settings[at, 2] = x, y, heading + looking[2]
+            for i in range(3, own):
+                settings[at, i] = looking[i]
+    return states, settings, np.empty((R * L, 1))
+
+
+@njit(cache=True, error_model="numpy")
+def count_looks(rows, detection, time, times, lifetime, visibility, share, left):  # type: ignore[no-untyped-def]
+    """Take L looks at falling times (L,) into account, of which the first is `time` before: the sum and the product of
+    the equation in `share` and `left` (M, C), of some rows, with p_D (R L, 1). The rows that are not settled."""
+    L, unsettled = len(times), np.empty_like(rows)
+    num = 0
+    for r in range(len(rows)):
+        m, then = rows[r], time
+        for k in range(L):
+            most = 0.0
+            for c in range(len(lifetime)):
+                stay = math.exp((times[k] - then) / lifetime[c])
+                share[m, c] += left[m, c] * (1.0 - stay)
+                left[m, c] *= stay * (1.0 - detection[r * L + k, 0] * visibility[c])
+                most = max(most, left[m, c])
+            then = times[k]
+            if most <= LEAST:
+                break
+        if most > LEAST:
+            unsettled[num] = m
+            num += 1
+    return unsettled[:num]

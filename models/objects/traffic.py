@@ -333,9 +333,8 @@ class Traffic:
         if not sensor.births or not num:
             return no_components(size, num)
         covariance = sensor.covariance(scan)
-        placed = sensor.place(
-            scan.values, np.broadcast_to(covariance, (num, *covariance.shape[1:])), mounted(scan.pose, sensor.mount)
-        )
+        covariance = covariance if len(covariance) == num else covariance.repeat(num, 0)
+        placed = sensor.place(scan.values, covariance, mounted(scan.pose, sensor.mount))
         flat = FLAT**2 * placed.covariance
         # a density of objects, as far as a normal one of this width is flat at its middle
         density = self.density(placed.position)
@@ -348,8 +347,9 @@ class Traffic:
         found = self._newcomers(number, placed.position, flat, heading, wide)
         if not self.depleted or not past:
             return found
-        left = left_over(self, scan, past, found.mean[found.offset[:-1]])
-        return found._replace(weight=found.weight * left[found.group, found.kind])
+        left = left_over(self, scan, past, placed.position)
+        weight = found.weight.reshape(*left.shape, -1) * left[:, :, None]
+        return found._replace(weight=weight.ravel())
 
     def arrivals(self, seconds: float) -> Bernoullis:
         if not self.places:
@@ -375,7 +375,7 @@ class Traffic:
         weights summing to number (B,)."""
         num = len(number)
         if heading is None or heading_std is None:
-            heading = np.broadcast_to(self._headings, (num, len(self._headings)))
+            heading = self._headings[None].repeat(num, 0)
             heading_std = np.full(num, HEADING_STD)
         loc, std = self._newcomer_states(position)
         return Components(

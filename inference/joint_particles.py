@@ -112,8 +112,8 @@ def predict(
         draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size))),
         component - parts.offset[which],
     )
-    both = (np.concatenate(pair) for pair in zip(belief[2:-1], fresh, strict=True))
-    belief = Scenes(belief.time, belief.log_weight, *both, belief.past)
+    label, particle, kind, state, family = map(np.concatenate, zip(belief[2:-1], fresh, strict=True))
+    belief = belief._replace(label=label, particle=particle, kind=kind, state=state, family=family)
     none = np.zeros((len(component), size, size))
     return belief, np.concatenate([survival, np.ones(len(component))]), np.concatenate([covariance, none])
 

@@ -92,7 +92,7 @@ class Clouds(NamedTuple):
 
     def only(self, rows: Any) -> Clouds:
         """Some of the objects."""
-        return Clouds(self.time, *(value[rows] for value in self[1:-1]), self.past)
+        return Clouds(self.time, *(value[rows] for value in self[1:-1]))._replace(past=self.past)
 
 
 def nobody(size: int, num_particles: int) -> Clouds:
@@ -129,9 +129,9 @@ def predict(
         state.reshape(-1, num, size),
         component.reshape(-1, num) - parts.offset[:-1, None],
     )
-    both = (np.concatenate(pair) for pair in zip(belief[1:-1], fresh, strict=True))
     covariance = np.concatenate([covariance, np.zeros((len(component), size, size))])
-    return Clouds(belief.time, *both, belief.past), covariance
+    label, existence, weight, kind, state, family = map(np.concatenate, zip(belief[1:-1], fresh, strict=True))
+    return Clouds(belief.time, label, existence, weight, kind, state, family, belief.past), covariance
 
 
 def moved_on(

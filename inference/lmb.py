@@ -54,7 +54,7 @@ class Knobs(NamedTuple):
     least: float = 1e-3
     merge: float = 2.0
     most: int = 4
-    faint: float = 1e-3
+    faint: float = 1e-4
     max_shared: int = 8
 
 

@@ -14,7 +14,7 @@ from inference import joint_particles, lmb, lmb_particles, nearest_neighbour
 from models.objects.depletion import LEAST, left_over
 from models.objects.motion import ConstantVelocity
 from models.objects.scans import Scan
-from models.objects.sensors import Position
+from models.objects.sensors import Position, RangeBearing
 from models.objects.traffic import Kind, Traffic
 from tests.test_lmb_calibration import followed, off_by, simulated
 
@@ -36,9 +36,9 @@ def looked(times: list[float], places: list[tuple[float, float]] | None = None, 
 
 def test_density_follows_its_recursion() -> None:
     """Sure within the view, of each kind: u <- u (1 - p_D), u <- s u + (1 - s) u_0; beyond it, as if nobody looked."""
-    times, state = [0.0, 0.5, 0.6, 1.6, 2.0, 2.1], np.array([[3.0, -8.0, 0.0, 0.0], [200.0, 0.0, 0.0, 0.0]])
+    times, place = [0.0, 0.5, 0.6, 1.6, 2.0, 2.1], np.array([[3.0, -8.0], [200.0, 0.0]])
     for num in range(len(times)):
-        found = left_over(MODEL, looked(times[num : num + 1])[0], looked(times[:num]), state)
+        found = left_over(MODEL, looked(times[num : num + 1])[0], looked(times[:num]), place)
         for k, lifetime in enumerate(LIFETIMES):
             u = 1.0
             for before, after in itertools.pairwise(times[: num + 1]):
@@ -50,8 +50,8 @@ def test_density_follows_its_recursion() -> None:
 
 def test_long_watched_ground_has_its_stationary_density() -> None:
     """u = s u (1 - p_D) + 1 - s, whatever there was at first."""
-    times, state = 0.1 * np.arange(40), np.zeros((1, 4))
-    found = left_over(MODEL, looked([4.0])[0], looked(times.tolist()), state)[0]
+    times, place = 0.1 * np.arange(40), np.zeros((1, 2))
+    found = left_over(MODEL, looked([4.0])[0], looked(times.tolist()), place)[0]
     stay = np.exp(-0.1 / np.array(LIFETIMES))
     assert found == pytest.approx((1 - stay) / (1 - stay * (1 - DETECTION * MODEL.visibility)), abs=LEAST)
 
@@ -60,7 +60,7 @@ def test_births_are_those_of_what_is_left() -> None:
     """In weights of components; where nobody, or only another sensor, has looked, of all."""
     scan = looked([1.0], [(3.0, -8.0), (20.0, 1.0)])[0]
     fresh, past = MODEL.unseen(scan), looked([0.0, 0.3])
-    left = left_over(MODEL, scan, past, np.array([[3.0, -8.0, 0.0, 0.0]]))[0]
+    left = left_over(MODEL, scan, past, np.array([[3.0, -8.0]]))[0]
     found = MODEL.unseen(scan, past)
     assert found.weight == pytest.approx(fresh.weight * left[fresh.kind], rel=1e-9)
     assert (left < 0.7).all()
@@ -71,8 +71,8 @@ def test_births_are_those_of_what_is_left() -> None:
 def test_what_may_be_hidden_is_left() -> None:
     """A sensor of occlusion o does not detect, with that mass, what is hidden: of p_D less is taken away."""
     hiding = replace(MODEL, sensors=(replace(EYE, occlusion=0.9),))
-    state = np.zeros((1, 4))
-    plain, hidden = (left_over(m, looked([0.1])[0], looked([0.0]), state)[0] for m in (MODEL, hiding))
+    place = np.zeros((1, 2))
+    plain, hidden = (left_over(m, looked([0.1])[0], looked([0.0]), place)[0] for m in (MODEL, hiding))
     assert (hidden > plain + 0.1).all()
 
 
@@ -89,6 +89,21 @@ def test_every_filter_tells_the_model_what_it_has_looked_at(engine: Any) -> None
     scans = [*looked([0.1 * i for i in range(6)]), looked([0.6], [(3.0, -8.0)])[0]]
     depleted, constant = (engine.run(replace(MODEL, depleted=d), scans, seed=3) for d in (True, False))
     assert depleted.log_evidence < constant.log_evidence
+
+
+def test_a_newborn_outlives_scans_of_sensors_that_do_not_look_there() -> None:
+    """Near the car, where false alarms of range and bearing are dense on the ground, it begins with a probability of
+    1e-4: a filter that leaves out what is less probable than 1e-3 forgets it before the laser looks again."""
+    laser = RangeBearing(name="laser", angle=3.7, noise_std=(0.1, 0.003), clutter=10.0)
+    camera = RangeBearing(name="camera", angle=1.0, reach=(0.0, 120.0), noise_std=(4.0, 0.003), births=False)
+    model, scans = Traffic((laser, camera), unseen_density=3e-4, depleted=True), list[Scan]()
+    for k in range(14):
+        shown = [(6.0 + 0.64 * (k - 8), 1.4)] if k >= 8 else []
+        scans.append(Scan("laser", 0.08 * k, np.array(shown).reshape(-1, 2), CAR))
+        scans.append(Scan("camera", 0.08 * k + 0.03, np.zeros((0, 2)), CAR))
+    last = len(scans) - 1
+    assert lmb.run(model, scans).at(last).existence.max() > 0.9
+    assert lmb.run(model, scans, faint=1e-3).at(last).existence.max(initial=0.0) < 0.1
 
 
 LIFETIME, GAP = 30.0, 0.5

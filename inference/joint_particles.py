@@ -37,7 +37,7 @@ from inference.lmb import STRIDE
 from inference.lmb_particles import check_particles, components_of, meet, moved_on
 from inference.object_particles import LEAST_MISS, draw_prior, moments, widen
 from inference.refusal import answers_first
-from inference.tracking import Facts, require_objects, track
+from inference.tracking import MEMORY, Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, joined
 from models.program import InputError
@@ -74,6 +74,7 @@ class Scenes(NamedTuple):
     kind        (R,)
     state       (R, n)
     family      (R,) in which component of the newcomers it began
+    past        the latest scans, by time
     """
 
     time: float | None
@@ -83,6 +84,7 @@ class Scenes(NamedTuple):
     kind: Ints
     state: Floats
     family: Ints
+    past: tuple[Timed, ...] = ()
 
     @property
     def weight(self) -> Floats:
@@ -110,8 +112,8 @@ def predict(
         draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size))),
         component - parts.offset[which],
     )
-    both = (np.concatenate(pair) for pair in zip(belief[2:], fresh, strict=True))
-    belief = Scenes(belief.time, belief.log_weight, *both)
+    label, particle, kind, state, family = map(np.concatenate, zip(belief[2:-1], fresh, strict=True))
+    belief = belief._replace(label=label, particle=particle, kind=kind, state=state, family=family)
     none = np.zeros((len(component), size, size))
     return belief, np.concatenate([survival, np.ones(len(component))]), np.concatenate([covariance, none])
 
@@ -139,7 +141,7 @@ def step(
     rng, num = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))), knobs.num_particles
     seconds = 0.0 if belief.time is None else scan.time - belief.time
     belief, survival, covariance = predict(model, belief, seconds, number, rng)
-    objects, unseen = by_label(belief, covariance, model.period, knobs.kernel), model.unseen(scan)
+    objects, unseen = by_label(belief, covariance, model.period, knobs.kernel), model.unseen(scan, belief.past)
     view, rows = model.view(scan, objects, unseen), len(belief.label)
     order = np.argsort(belief.particle, kind="stable")
     start = np.searchsorted(belief.particle[order], np.arange(num + 1))
@@ -170,7 +172,8 @@ def step(
     family = np.concatenate([belief.family[old[kept]], new_part - unseen.offset[new_made]])
     by = np.lexsort((particle, label))
     kind = parts.kind[component]
-    posterior = Scenes(scan.time, log_weight - log_more, label[by], particle[by], kind[by], state[by], family[by])
+    rows_of = (label[by], particle[by], kind[by], state[by], family[by])
+    posterior = Scenes(scan.time, log_weight - log_more, *rows_of, (*belief.past[1 - MEMORY :], scan))
     return posterior, Facts(log_factor + log_more, int(loopy > 0)), worth
 
 

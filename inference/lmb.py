@@ -30,7 +30,7 @@ import numpy as np
 from inference.association import MAX_BITS
 from inference.lmb_kernel import heaviest, propagate, update
 from inference.refusal import answers_first
-from inference.tracking import Facts, require_objects, track
+from inference.tracking import MEMORY, Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Ints, Timed, no_objects, together
 from models.program import InputError
@@ -54,7 +54,7 @@ class Knobs(NamedTuple):
     least: float = 1e-3
     merge: float = 2.0
     most: int = 4
-    faint: float = 1e-3
+    faint: float = 1e-4
     max_shared: int = 8
 
 
@@ -76,12 +76,13 @@ def check(knobs: Knobs, report: float) -> None:
 
 
 class Belief(NamedTuple):
-    """What is believed at a time [s], None before the first scan; and which measurement of the scan of then most
-    probably is of each object (T,), -1 where it was more probably missed."""
+    """What is believed at a time [s], None before the first scan; which measurement of the scan of then most probably
+    is of each object (T,), -1 where it was more probably missed; and the latest scans, by time."""
 
     time: float | None
     objects: Bernoullis
     measurement: Ints = np.zeros(0, dtype=np.int64)
+    past: tuple[Timed, ...] = ()
 
 
 def moved(model: HasObjects, objects: Bernoullis, seconds: float) -> Bernoullis:
@@ -113,7 +114,7 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
     objects, seconds = belief.objects, 0.0 if belief.time is None else scan.time - belief.time
     if seconds > 0.0:
         objects = predict(model, belief, seconds, number)
-    unseen = model.unseen(scan)
+    unseen = model.unseen(scan, belief.past)
     view = model.view(scan, objects, unseen)
     source, measurement, existence, *parts, (log_factor, loopy, left_out) = update(
         objects.existence, *objects.components, *unseen, *view,
@@ -130,7 +131,8 @@ def step(model: HasObjects, belief: Belief, scan: Timed, number: int, knobs: Kno
             "variance; look for noises, speeds or gaps between scans that are far too large"
         )
     posterior = Bernoullis(label, existence, Components(*parts))
-    return Belief(scan.time, posterior, measurement), Facts(log_factor, int(loopy), float(left_out))
+    past = (*belief.past[1 - MEMORY :], scan)
+    return Belief(scan.time, posterior, measurement, past), Facts(log_factor, int(loopy), float(left_out))
 
 
 def tell(belief: Belief, report: float, num_kinds: int) -> Objects:

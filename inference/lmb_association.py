@@ -89,7 +89,7 @@ def pairs_of(model: HasObjects, belief: Belief, scan: Any, number: int, gate: fl
     """What the objects of a belief and the measurements of a scan, taken next, have to do with each other."""
     seconds = 0.0 if belief.time is None else scan.time - belief.time
     objects = lmb.predict(model, belief, seconds, number) if seconds > 0.0 else belief.objects
-    new = model.unseen(scan)
+    new = model.unseen(scan, belief.past)
     view = model.view(scan, objects, new)
     parts, count = objects.components, len(objects.components.weight)
     shared = (view.predicted, view.slope, view.detection, view.values, view.noise, view.sort)

@@ -34,7 +34,7 @@ from inference.lmb_kernel import survive
 from inference.lmb_particles_kernel import update
 from inference.object_particles import draw, draw_prior, log_corrections, moments, widen
 from inference.refusal import answers_first
-from inference.tracking import Facts, require_objects, track
+from inference.tracking import MEMORY, Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, joined
 from models.program import InputError
@@ -65,7 +65,7 @@ class Clouds(NamedTuple):
     """T objects of N particles each at a time [s], None before the first scan.
 
     label (T,), existence (T,), weight (T, N) summing to one by object, kind (T, N), state (T, N, n), and family (T, N):
-    in which component of the newcomers a particle began
+    in which component of the newcomers a particle began. past: the latest scans, by time
     """
 
     time: float | None
@@ -75,6 +75,7 @@ class Clouds(NamedTuple):
     kind: Ints
     state: Floats
     family: Ints
+    past: tuple[Timed, ...] = ()
 
     @property
     def offset(self) -> Ints:
@@ -91,7 +92,7 @@ class Clouds(NamedTuple):
 
     def only(self, rows: Any) -> Clouds:
         """Some of the objects."""
-        return Clouds(self.time, *(value[rows] for value in self[1:]))
+        return Clouds(self.time, *(value[rows] for value in self[1:-1]))._replace(past=self.past)
 
 
 def nobody(size: int, num_particles: int) -> Clouds:
@@ -128,9 +129,9 @@ def predict(
         state.reshape(-1, num, size),
         component.reshape(-1, num) - parts.offset[:-1, None],
     )
-    both = (np.concatenate(pair) for pair in zip(belief[1:], fresh, strict=True))
     covariance = np.concatenate([covariance, np.zeros((len(component), size, size))])
-    return Clouds(belief.time, *both), covariance
+    label, existence, weight, kind, state, family = map(np.concatenate, zip(belief[1:-1], fresh, strict=True))
+    return Clouds(belief.time, label, existence, weight, kind, state, family, belief.past), covariance
 
 
 def moved_on(
@@ -214,7 +215,7 @@ def step(model: HasObjects, belief: Clouds, scan: Timed, number: int, knobs: Kno
     rng, num = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))), knobs.num_particles
     seconds = 0.0 if belief.time is None else scan.time - belief.time
     belief, covariance = predict(model, belief, seconds, number, rng)
-    objects, unseen = regularise(belief, covariance, model.period, knobs.kernel), model.unseen(scan)
+    objects, unseen = regularise(belief, covariance, model.period, knobs.kernel), model.unseen(scan, belief.past)
     view, old = model.view(scan, objects, unseen), belief.weight.size
     existence, uniform = objects.existence.copy(), rng.random(len(belief.label))
     component, chosen, first, mass, (log_factor, loopy) = update(
@@ -241,6 +242,7 @@ def step(model: HasObjects, belief: Clouds, scan: Timed, number: int, knobs: Kno
         parts.kind[whose].reshape(-1, num),
         state.reshape(-1, num, state.shape[1]),
         family[whose].reshape(-1, num),
+        (*belief.past[1 - MEMORY :], scan),
     )
     return posterior, Facts(log_factor, int(loopy), float(left_out))
 

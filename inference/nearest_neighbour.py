@@ -26,7 +26,7 @@ from inference.association import MISSED, Table, best
 from inference.lmb_kernel import heaviest
 from inference.refusal import answers_first
 from inference.track_kernel import see, weights_of
-from inference.tracking import Facts, require_objects, track
+from inference.tracking import MEMORY, Facts, require_objects, track
 from inference.tracks import Objects, Tracks
 from models.multi_object import Bernoullis, Components, HasObjects, Timed, View, no_objects, together
 from models.program import InputError
@@ -64,6 +64,7 @@ class Instances(NamedTuple):
     vain     (T,) of these, those since the last measurement
     last     (T,) time of the last measurement [s]
     sure     (T,) whether it is confirmed
+    past     the latest scans, by time
     """
 
     time: float | None
@@ -73,6 +74,7 @@ class Instances(NamedTuple):
     vain: Ints
     last: Floats
     sure: NDArray[np.bool_]
+    past: tuple[Timed, ...] = ()
 
 
 def nobody(size: int) -> Instances:
@@ -85,7 +87,7 @@ def step(model: HasObjects, belief: Instances, scan: Timed, number: int, knobs: 
     """Predict to the scan, associate, update, begin and end. The scan must not be older than the belief."""
     belief = predict(model, belief, scan.time, number)
     objects, (label, existence, components) = belief.objects, belief.objects
-    unseen = model.unseen(scan)
+    unseen = model.unseen(scan, belief.past)
     view = model.view(scan, objects, unseen)
     num, count = len(view.values), len(components.weight)
     known, new = part_of(view, slice(count)), part_of(view, slice(count, None))
@@ -120,7 +122,8 @@ def step(model: HasObjects, belief: Instances, scan: Timed, number: int, knobs: 
     )
     hits, looks, vain = (np.append(a[keep], b) for a, b in ((hits, ones), (looks, ones), (vain, 0 * ones)))
     last, sure = np.append(last[keep], scan.time * ones), np.append(sure[keep], ones * knobs.hits <= 1)
-    return Instances(scan.time, after, hits, looks, vain, last, sure), Facts(log_factor)
+    past = (*belief.past[1 - MEMORY :], scan)
+    return Instances(scan.time, after, hits, looks, vain, last, sure, past), Facts(log_factor)
 
 
 def predict(model: HasObjects, belief: Instances, now: float, number: int) -> Instances:
@@ -133,7 +136,7 @@ def predict(model: HasObjects, belief: Instances, now: float, number: int) -> In
     more = len(moved.label) - num
     hits, looks, vain = (np.append(values, np.zeros(more, dtype=np.int64)) for values in belief[2:5])
     last, sure = np.append(belief.last, np.full(more, now)), np.append(belief.sure, np.zeros(more, dtype=bool))
-    return Instances(now, moved._replace(existence=existence), hits, looks, vain, last, sure)
+    return Instances(now, moved._replace(existence=existence), hits, looks, vain, last, sure, belief.past)
 
 
 def summed(components: Components, values: Floats) -> Floats:

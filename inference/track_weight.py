@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from inference.lmb import moved
 from inference.track_kernel import see
+from inference.tracking import MEMORY
 from models.multi_object import Bernoullis, Components, HasObjects, View, no_components, no_objects, together
 from models.program import InputError
 
@@ -106,12 +107,12 @@ def window_of(model: HasObjects, scans: Sequence[Any]) -> Window:
     size, waiting = len(model.names), no_objects(len(model.names))
     views, prior, born, first = list[View](), list[Components](), list[Components](), list[Floats]()
     seconds = np.diff(times, prepend=times[:1])
-    for scan, gap in zip(scans, seconds.tolist(), strict=True):
+    for number, (scan, gap) in enumerate(zip(scans, seconds.tolist(), strict=True)):
         if gap > 0.0:
             waiting, arrived = moved(model, waiting, gap), model.arrivals(gap)
             expected = -np.log1p(-np.minimum(arrived.existence, SUREST))
             waiting = together(waiting, arrived._replace(existence=expected))
-        new = _with_all(model.unseen(scan), waiting)
+        new = _with_all(model.unseen(scan, scans[max(number - MEMORY, 0) : number]), waiting)
         view = model.view(scan, no_objects(size), new)
         mine = picked(new, np.arange(len(new.weight)), new.offset)
         first.append(see(*mine, np.arange(len(view.values)), *view, np.inf))

@@ -20,6 +20,7 @@ from inference.tracks import Objects, Tracks
 from models.multi_object import HasObjects, Timed
 from models.program import InputError
 
+MEMORY = 32  # scans that a model is told of, to know where sensors have looked
 LOST = 0.01  # of the objects expected: more than that left out is flagged
 
 

@@ -112,8 +112,9 @@ class HasObjects(Protocol):
     move(kind (N,), mean (N, n), seconds) -> Moved
     view(scan, objects, more) -> View of the components of `objects`, then of those of `more`; detection of the first
         may depend on all objects, of which nearer ones hide farther ones
-    unseen(scan) -> a group of components for each measurement: near it, weight times density is the intensity of
-        objects not seen before, as far as this measurement can tell where (no components: it cannot)
+    unseen(scan, past) -> a group of components for each measurement: near it, weight times density is the intensity of
+        objects not seen before, as far as this measurement can tell where (no components: it cannot). `past` are the
+        latest scans before it, by time: where they looked, fewer may be left
     arrivals(seconds) -> objects that came at known places in this time; their labels are not read
     check(data) -> the scans in the order given; raises InputError for one that cannot be used
     """
@@ -131,7 +132,7 @@ class HasObjects(Protocol):
 
     def view(self, scan: Any, objects: Bernoullis, more: Components) -> View: ...
 
-    def unseen(self, scan: Any) -> Components: ...
+    def unseen(self, scan: Any, past: Sequence[Any] = ()) -> Components: ...
 
     def arrivals(self, seconds: float) -> Bernoullis: ...
 

@@ -82,7 +82,7 @@ class Line:
             self.period[:1],
         )
 
-    def unseen(self, scan: LineScan) -> Components:
+    def unseen(self, scan: LineScan, past: Sequence[LineScan] = ()) -> Components:
         M = len(scan.values)
         if self.unseen_number == 0.0 or not M:
             return no_components(2, M)

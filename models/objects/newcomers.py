@@ -1,6 +1,9 @@
-"""Machine code that lays out the components of newcomers: every kind at every heading that is possible."""
+"""Machine code that lays out the components of newcomers: where they are, every kind at every heading that is
+possible."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import njit
@@ -35,3 +38,21 @@ def lay_out(number, position, covariance, heading, heading_std, entry, loc, std,
                     mean[at, entry], spread[at, entry, entry] = heading[b, h], heading_std[b] ** 2
                 at += 1
     return offset, weight, kind, mean, spread
+
+
+@njit(cache=True, error_model="numpy")
+def from_polar(values, noise, at):  # type: ignore[no-untyped-def]
+    """Positions (M, 2) in the world of what is at ranges and bearings, the first of values (M, d), from a pose (3,),
+    and their covariances (M, 2, 2) = J R J' where those of the values are noise (M, d, d)."""
+    num = len(values)
+    position, covariance = np.empty((num, 2)), np.empty((num, 2, 2))
+    for i in range(num):
+        distance, angle = values[i, 0], values[i, 1] + at[2]
+        cos, sin = math.cos(angle), math.sin(angle)
+        a, b, c, d = cos, -distance * sin, sin, distance * cos  # J, by rows
+        R, S, T = noise[i, 0, 0], noise[i, 0, 1], noise[i, 1, 1]
+        position[i, 0], position[i, 1] = at[0] + distance * cos, at[1] + distance * sin
+        covariance[i, 0, 0] = a * a * R + 2.0 * a * b * S + b * b * T
+        covariance[i, 1, 1] = c * c * R + 2.0 * c * d * S + d * d * T
+        covariance[i, 0, 1] = covariance[i, 1, 0] = a * c * R + (a * d + b * c) * S + b * d * T
+    return position, covariance

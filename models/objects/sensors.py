@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from models.formula import Formula
 from models.objects.motion import ANGLES, Body, Motion
+from models.objects.newcomers import from_polar
 from models.objects.perception import capability, combined, hidden_share, hindrance, logistic, probability
 from models.objects.scans import Scan
 from models.program import InputError
@@ -118,6 +119,12 @@ class Sensor:
         """The numbers that p_D depends on: capability, weather, view."""
         return (self.detection, self.doubt, self.weather or 0.0, *self.view_settings)
 
+    @cached_property
+    def looking(self) -> Floats:
+        """(3 + .,) `mount`, `settings` and `occlusion`: what p_D reads of a sensor at a pose of the car, where all that
+        may be hidden is."""
+        return np.array((*self.mount, *self.settings, self.occlusion), dtype=np.float64)
+
     @property
     def noise_settings(self) -> tuple[float, ...]:
         """The numbers that `spread` reads."""
@@ -179,6 +186,10 @@ class Sensor:
     def _clutter_density(self) -> float:
         return self.clutter / float(np.prod(self.span[:, 1] - self.span[:, 0]))
 
+    @cached_property
+    def _covariance(self) -> Floats:
+        return np.diag(np.square(self.noise_std))[None]
+
     def feature(self, scan: Scan, num_kinds: int) -> Floats:
         """(M, C) p(score, looks | kind) / p(score, looks | false alarm). A score s that is the probability to be no
         false alarm says s / (1 - s), up to the odds before, which are those of clutter and births."""
@@ -192,7 +203,7 @@ class Sensor:
         if scan.noise is not None:
             return scan.noise
         if type(self).spread is Sensor.spread:
-            return np.diag(np.square(self.noise_std))[None]
+            return self._covariance
         formula = spread_formula(type(self), len(self.noise_settings))  # type: ignore[arg-type]
         std = formula(scan.values, np.array([self.noise_settings]))
         return np.square(std)[:, :, None] * np.eye(std.shape[1])
@@ -270,12 +281,7 @@ class Position(Sensor):
 
 def placed(values: Floats, noise: Floats, at: Floats) -> Placed:
     """Where range and bearing, the first of what is measured (M, d), are in the world."""
-    distance, angle = values[:, 0], values[:, 1] + at[2]
-    cos, sin = np.cos(angle), np.sin(angle)
-    slope, position = np.empty((len(values), 2, 2)), np.empty((len(values), 2))
-    slope[:, 0, 0], slope[:, 0, 1], slope[:, 1, 0], slope[:, 1, 1] = cos, -distance * sin, sin, distance * cos
-    position[:, 0], position[:, 1] = at[0] + distance * cos, at[1] + distance * sin
-    return Placed(position, slope @ noise[:, :2, :2] @ slope.swapaxes(-1, -2))
+    return Placed(*from_polar(values, noise, at))
 
 
 @dataclass(frozen=True, kw_only=True)

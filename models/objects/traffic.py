@@ -6,12 +6,12 @@
     sensors  models.objects.sensors
 
 [K15] tracks with a labeled multi-Bernoulli filter; what is said here is the model under it. Objects that no scan has
-shown yet are a Poisson process of constant density, as in Williams (2015), so that a first measurement begins a track
-with the probability that it is an object rather than a false alarm, in its own scan.
+shown yet are a Poisson process, as in Williams (2015), so that a first measurement begins a track with the probability
+that it is an object rather than a false alarm, in its own scan.
 
-Filters and program differ in one thing. To a filter the density of the unseen is the same at every scan (new ground
-comes into view as the car moves); in the program it is that of the first frame, and objects in view are soon seen:
-whoever comes later comes as others go, or from places.
+In the program the density of the unseen is that of the first frame, and objects in view are soon seen: whoever comes
+later comes as others go, or from places. So it is to filters where the model is `depleted`; else they and the program
+differ in this one thing: to a filter the density is the same at every scan.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from models.formula import Formula
 from models.multi_object import Bernoullis, Components, Moved, View, joined, no_components, no_objects
+from models.objects.depletion import left_over
 from models.objects.ground import Ground, limited
 from models.objects.motion import ANGLES, ConstantTurn, Motion, move_formula, noise_formula
 from models.objects.newcomers import lay_out
@@ -108,7 +109,8 @@ class Traffic:
     sensors: tuple[Sensor, ...]
     motion: Motion = field(default_factory=ConstantTurn)
     kinds: tuple[Kind, ...] = (Kind(),)
-    unseen_density: float = 1e-4  # [1/m^2]: of ground that stays in view, what arrives between two scans
+    unseen_density: float = 1e-4  # [1/m^2]: where nobody has looked; if not depleted, what arrives between two scans
+    depleted: bool = False  # whether fewer are left where a sensor has looked (models.objects.depletion)
     places: tuple[Place, ...] = ()
     ground: Ground | None = None  # where it is known, instead of unseen_density
     region: tuple[float, float, float, float] = (-100.0, -100.0, 100.0, 100.0)  # x, y to x, y [m]: of the program
@@ -196,7 +198,8 @@ class Traffic:
         return np.array([kind.radius for kind in self.kinds])
 
     @cached_property
-    def _lifetime(self) -> Floats:
+    def lifetime(self) -> Floats:
+        """(C,) of the kinds [s]."""
         return np.array([kind.lifetime for kind in self.kinds])
 
     def sensor(self, scan: Scan) -> Sensor:
@@ -209,7 +212,7 @@ class Traffic:
         return self._sensors[scan.sensor]
 
     def density(self, position: Floats) -> Floats:
-        """(N,) of unseen objects at positions (N, 2) [1/m^2]."""
+        """(N,) of unseen objects at positions (N, 2) [1/m^2], where nobody has looked."""
         return np.full(len(position), self.unseen_density) if self.ground is None else self.ground.density(position)
 
     @cached_property
@@ -232,8 +235,8 @@ class Traffic:
         """(O, C) newcomers expected to be there after a time, from anywhere in the region and from each place, by kind:
         int_0^t rate e^(-s / lifetime) ds, the rate of those from anywhere being what balances those that go."""
         share = np.array([kind.share for kind in self.kinds])
-        staying = -np.expm1(-seconds / self._lifetime)
-        places = [place.rate * share * self._lifetime * staying for place in self.places]
+        staying = -np.expm1(-seconds / self.lifetime)
+        places = [place.rate * share * self.lifetime * staying for place in self.places]
         return np.vstack([self.unseen_numbers[0] * staying, *places])
 
     def newcomers(self, kind: Kind, position: Floats) -> tuple[Floats, Floats]:
@@ -287,7 +290,7 @@ class Traffic:
         settings[:, 0], settings[:, 1:] = seconds, self.noises[kind]
         move_formula(self.motion).compiled()(mean, settings, moved, slope)
         noise_formula(self.motion).compiled(jacobian=False)(mean, settings, noise)
-        return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self._lifetime[kind]))
+        return Moved(moved, slope, noise.reshape(num, size, -1), np.exp(-seconds / self.lifetime[kind]))
 
     def view(self, scan: Scan, objects: Bernoullis, more: Components) -> View:
         sensor = self.sensor(scan)
@@ -325,25 +328,28 @@ class Traffic:
         share[np.arange(len(parts.mean)), parts.group] = 0.0  # nobody hides itself
         return np.asarray(sensor.occlusion * hidden_by_any(share, objects.existence))
 
-    def unseen(self, scan: Scan) -> Components:
+    def unseen(self, scan: Scan, past: Sequence[Scan] = ()) -> Components:
         sensor, size, num = self.sensor(scan), len(self.names), len(scan.values)
         if not sensor.births or not num:
             return no_components(size, num)
         covariance = sensor.covariance(scan)
-        placed = sensor.place(
-            scan.values, np.broadcast_to(covariance, (num, *covariance.shape[1:])), mounted(scan.pose, sensor.mount)
-        )
+        covariance = covariance if len(covariance) == num else covariance.repeat(num, 0)
+        placed = sensor.place(scan.values, covariance, mounted(scan.pose, sensor.mount))
         flat = FLAT**2 * placed.covariance
         # a density of objects, as far as a normal one of this width is flat at its middle
-        number = (
-            self.density(placed.position) * 2 * math.pi * np.sqrt(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] ** 2)
-        )
-        if placed.heading is None:
-            return self._newcomers(number, placed.position, flat)
-        shared = math.sqrt(2 * math.pi) / placed.heading.shape[1]  # the width at which their weights sum to one
-        wide = np.full(num, shared) if placed.heading_std is None else FLAT * placed.heading_std
-        number = number * wide / shared  # the same for the density 1 / (2 pi) of each heading
-        return self._newcomers(number, placed.position, flat, placed.heading, wide)
+        density = self.density(placed.position)
+        number = density * 2 * math.pi * np.sqrt(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] ** 2)
+        heading, wide = placed.heading, placed.heading_std
+        if heading is not None:
+            shared = math.sqrt(2 * math.pi) / heading.shape[1]  # the width at which their weights sum to one
+            wide = np.full(num, shared) if wide is None else FLAT * wide
+            number = number * wide / shared  # the same for the density 1 / (2 pi) of each heading
+        found = self._newcomers(number, placed.position, flat, heading, wide)
+        if not self.depleted or not past:
+            return found
+        left = left_over(self, scan, past, placed.position)
+        weight = found.weight.reshape(*left.shape, -1) * left[:, :, None]
+        return found._replace(weight=weight.ravel())
 
     def arrivals(self, seconds: float) -> Bernoullis:
         if not self.places:
@@ -369,7 +375,7 @@ class Traffic:
         weights summing to number (B,)."""
         num = len(number)
         if heading is None or heading_std is None:
-            heading = np.broadcast_to(self._headings, (num, len(self._headings)))
+            heading = self._headings[None].repeat(num, 0)
             heading_std = np.full(num, HEADING_STD)
         loc, std = self._newcomer_states(position)
         return Components(

@@ -63,7 +63,7 @@ def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
     qx = ahead - ops.fmin(ops.fmax(ahead, -half_length), half_length)
     qy = left - ops.fmin(ops.fmax(left, -half_width), half_width)
     squared = qx * qx + qy * qy
-    spread = qx * qx * along + 2 * qx * qy * mixed + qy * qy * across
+    spread = ops.fmax(qx * qx * along + 2 * qx * qy * mixed + qy * qy * across, 0.0)  # of a flat one, to rounding
     return (squared - radius * ops.sqrt(squared) - z * ops.sqrt(spread),)
 
 
@@ -102,7 +102,7 @@ class Obstacles(NamedTuple):
         across = sin**2 * S[..., 0, 0] - 2 * cos * sin * S[..., 0, 1] + cos**2 * S[..., 1, 1]
         mixed = cos * sin * (S[..., 1, 1] - S[..., 0, 0]) + (cos**2 - sin**2) * S[..., 0, 1]
         half = np.broadcast_to(size[:, None] / 2, (*cos.shape, 2))
-        widest = z * np.sqrt(np.linalg.eigvalsh(S)[..., 1]) if len(S) else np.zeros_like(cos)
+        widest = z * np.sqrt(np.maximum(np.linalg.eigvalsh(S)[..., 1], 0.0)) if len(S) else np.zeros_like(cos)
         near = (np.hypot(half[..., 0], half[..., 1]) + reach + widest) ** 2
         told = [pose[..., 0], pose[..., 1], cos, sin, half[..., 0], half[..., 1], along, mixed, across]
         return np.ascontiguousarray(np.stack([*told, np.broadcast_to(z, cos.shape), near], 1))
@@ -114,8 +114,8 @@ def no_obstacles(num_steps: int) -> Obstacles:
 
 
 def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
-    """Raises InputError for wrong shapes, NaN, sizes that are not positive, covariances with negative eigenvalues, and
-    probabilities outside [0, 1]."""
+    """Raises InputError for wrong shapes, NaN, sizes that are not positive, covariances that are not symmetric or have
+    negative eigenvalues, and probabilities outside [0, 1]."""
     num = len(obstacles.pose)
     wanted = {
         "pose": (num, num_steps, 3),
@@ -132,7 +132,11 @@ def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
             raise InputError(f"obstacle {first}: {name} is not finite")
     for which in np.flatnonzero((obstacles.size <= 0).any(1)):
         raise InputError(f"obstacle {which}: its size is {obstacles.size[which].tolist()}, but must be positive [m]")
-    if num and (np.linalg.eigvalsh(obstacles.covariance) < -1e-9).any():
+    S = obstacles.covariance
+    crooked = np.abs(S[..., 0, 1] - S[..., 1, 0]) > 1e-9 * (1 + np.abs(S[..., 0, 1]))
+    for which in np.flatnonzero(crooked.any(1)):
+        raise InputError(f"obstacle {which}: its covariance is not symmetric")
+    if num and (np.linalg.eigvalsh(S) < -1e-9).any():
         raise InputError("obstacles: a covariance has a negative eigenvalue")
     if ((obstacles.probability < 0) | (obstacles.probability > 1)).any():
         raise InputError(f"obstacles: probabilities are {obstacles.probability.tolist()}, but lie between 0 and 1")

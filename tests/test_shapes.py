@@ -13,6 +13,7 @@ from shapely import affinity
 
 from models.program import InputError
 from planning.boundary_kernel import first_line
+from planning.check_kernel import first_rectangle
 from planning.shapes import CLEARANCE, Boundary, Obstacles, Vehicle, boundary
 
 VEHICLE = Vehicle()
@@ -72,6 +73,22 @@ def test_a_chance_constraint_at_its_limit_is_kept_in_simulation() -> None:
             assert rate < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 40000)
             if bearing == 2.0:
                 assert rate > 0.02, "a straight side is met about as often as allowed"
+
+
+def test_a_place_uncertain_in_one_direction_only_is_met_beside_it_as_if_it_were_certain() -> None:
+    """Rounding makes the variance across a flat covariance negative about as often as not."""
+    for heading in np.linspace(-3.0, 3.0, 101):
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        left = np.array([-ahead[1], ahead[0]])
+        flat = 0.49 * np.outer(ahead, ahead)
+        body = Obstacles(np.array([[[0.0, 0.0, heading]]]), np.array([[4.0, 2.0]]), flat[None, None], np.ones(1))
+        row = body.table(1e-3, 1.0, 5.0)[0, :, 0]
+        margin = margins(row, np.stack([1.9 * left, 2.1 * left]), 1.0)
+        assert margin[0] < 0 < margin[1]
+        pose = np.array([[1.9 * left[0]], [1.9 * left[1]], [1.0], [0.0]])
+        assert first_rectangle(pose, row[None, :, None], 0.0, np.zeros(1), 1.0) == 0
+        row[6] = math.nan
+        assert first_rectangle(pose * 1.2, row[None, :, None], 0.0, np.zeros(1), 1.0) == 0, "NaN is not clear"
 
 
 def test_unlikely_objects_get_a_larger_chance_each_and_the_unlikeliest_none() -> None:

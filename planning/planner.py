@@ -59,14 +59,18 @@ class Planner:
         for name in ("horizon", "step", "risk"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"planner: {name} is {getattr(self, name)}, but must be positive and finite")
-        for name in LIMITS:
+        if self.num_steps < 1:
+            raise InputError(f"planner: a horizon of {self.horizon} s has no step of {self.step} s")
+        if self.risk >= 1.0:
+            raise InputError(f"planner: risk is {self.risk}, but is a probability below 1")
+        for name in (*LIMITS, "curvature_rate"):
             if getattr(self.able, name) < getattr(self.comfort, name):
                 raise InputError(
                     f"planner: comfort.{name} is {getattr(self.comfort, name)}, more than the vehicle can: "
                     f"able.{name} is {getattr(self.able, name)}"
                 )
-        if self.margin < 0:
-            raise InputError(f"planner: margin is {self.margin}, but must be 0 or more [m]")
+        if not 0.0 <= self.margin < math.inf:
+            raise InputError(f"planner: margin is {self.margin}, but must be 0 or more and finite [m]")
 
     @property
     def num_steps(self) -> int:
@@ -271,9 +275,17 @@ def check(planner: Planner, scene: Scene) -> None:
             f"the vehicle is at s {scene.state.s:.1f} m of a line from 0 to {scene.line.length:.1f} m; "
             "choose a longer one"
         )
-    if not all(map(math.isfinite, scene.goal)):
-        raise InputError(f"the goal {scene.goal} is not finite")
-    if not len(scene.offsets) or not np.isfinite(scene.offsets).all() or not math.isfinite(scene.wanted):
+    for name, value in zip(scene.goal._fields, scene.goal, strict=True):
+        if not (math.isfinite(value) or (name == "until" and value == math.inf)):
+            raise InputError(f"the goal {scene.goal} is not finite")
+    if scene.goal.speed < 0.0:
+        raise InputError(f"the goal {scene.goal} has a negative speed; 0 stands still")
+    if (
+        np.ndim(scene.offsets) != 1
+        or not len(scene.offsets)
+        or not np.isfinite(scene.offsets).all()
+        or not math.isfinite(scene.wanted)
+    ):
         raise InputError(
             f"offsets to drive to are {np.asarray(scene.offsets).tolist()}, but must be one or more numbers"
         )

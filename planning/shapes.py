@@ -39,6 +39,8 @@ class Vehicle:
         for name in ("length", "width", "num_circles"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"vehicle: {name} is {getattr(self, name)}, but must be positive and finite")
+        if not math.isfinite(self.middle) or self.num_circles != int(self.num_circles):
+            raise InputError(f"vehicle: middle is {self.middle} and num_circles {self.num_circles}: a length, a number")
 
     @property
     def front(self) -> float:

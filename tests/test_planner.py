@@ -228,6 +228,12 @@ def test_unlikely_and_uncertain_road_users() -> None:
         ({"state": START._replace(ds=math.nan)}, "ds = nan"),
         ({"state": START._replace(s=400.0)}, "choose a longer one"),
         ({"goal": Reach(math.inf)}, "not finite"),
+        ({"goal": Reach(50.0, until=math.nan)}, "not finite"),
+        ({"goal": Keep(-1.0)}, "negative speed"),
+        ({"state": START._replace(s=-0.1)}, "choose a longer one"),
+        ({"offsets": np.zeros((2, 2))}, "one or more numbers"),
+        ({"wanted": math.nan}, "one or more numbers"),
+        ({"stand": math.nan}, "stand is NaN"),
         ({"offsets": np.zeros(0)}, "one or more numbers"),
         ({"boundary": boundary([], 0.5)}, "build them with that reach"),
         ({"stop": math.nan}, "stop is NaN"),
@@ -247,6 +253,8 @@ def test_scenes_that_are_none_are_refused_in_words(change: dict[str, Any], words
 def test_limits_that_contradict_are_refused() -> None:
     with pytest.raises(InputError, match=r"comfort.braking is 9.0, more than the vehicle can: able.braking is 8.0"):
         Planner(comfort=Limits(braking=9.0))
+    with pytest.raises(InputError, match=r"comfort.curvature_rate is 0.5, more than the vehicle can"):
+        Planner(comfort=Limits(curvature_rate=0.5))
     with pytest.raises(InputError, match="speed is -1"):
         Limits(speed=-1.0)
     with pytest.raises(InputError, match="vehicle: length is 0"):

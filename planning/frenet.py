@@ -9,7 +9,6 @@ import math
 from typing import NamedTuple
 
 from models.program import InputError
-from planning.kinematics import NARROWEST
 from planning.reference import ReferenceLine
 from planning.reference_kernel import BEYOND_ENDS, FOUND
 
@@ -67,8 +66,6 @@ def to_frenet(line: ReferenceLine, pose: Pose, start: float | None = None) -> Fr
             f"the vehicle heads {math.degrees(turned):.0f} degrees away from the line at s {s:.1f} m; "
             f"choose a line that runs its way (within {math.degrees(STEEPEST):.0f} degrees)"
         )
-    if w < NARROWEST:
-        raise InputError(f"the vehicle is {d:.1f} m off the line, near its centre of curvature, at s {s:.1f} m")
     slope = w * math.tan(turned)
     n = w / math.cos(turned)  # way per arc length
     narrowing = -(rate * d + kappa * slope)  # dw/ds

@@ -23,6 +23,7 @@ from models.formula import Formula
 from models.program import InputError
 
 Floats = NDArray[np.float64]
+MOST_CELLS = 20_000_000  # of that grid: some 4 km by 4 km
 CELL = 1.0  # of the grid in which segments of boundary lines are found [m]
 
 
@@ -167,7 +168,7 @@ class Boundary(NamedTuple):
 def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, float, float] | None = None) -> Boundary:
     """Of lines, each (N, 2) points [m]; `within` keeps what is nearer than r to (x, y): (x, y, r).
 
-    Raises InputError for NaN and wrong shapes."""
+    Raises InputError for NaN, wrong shapes, and lines that span more than MOST_CELLS cells."""
     from planning.boundary_kernel import bucket
 
     parts = [np.zeros((0, 4))]
@@ -185,7 +186,16 @@ def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, f
         none = np.zeros(0, np.int64)
         return Boundary(segment, np.zeros(2), np.zeros(2, np.int64), np.zeros(1, np.int64), none, CELL, reach)
     ends = segment.reshape(-1, 2)
-    origin = ends.min(0) - reach - CELL
-    shape = np.ceil((ends.max(0) + reach + CELL - origin) / CELL).astype(np.int64)
+    lower, upper = ends.min(0), ends.max(0)
+    if within is not None:
+        x, y, r = within
+        lower, upper = np.maximum(lower, [x - r, y - r]), np.minimum(upper, [x + r, y + r])
+        upper = np.maximum(lower, upper)  # a long segment may be kept that passes by
+    origin = lower - reach - CELL
+    cells = np.ceil((upper + reach + CELL - origin) / CELL)
+    if cells.prod() > MOST_CELLS:
+        span = " by ".join(f"{width:.0f}" for width in upper - lower)
+        raise InputError(f"boundary lines span {span} m, too much for one grid; keep what is near by `within`")
+    shape = cells.astype(np.int64)
     offset, member = bucket(segment, origin, shape, CELL, reach)
     return Boundary(np.ascontiguousarray(segment), origin, shape, offset, member, CELL, reach)

@@ -239,6 +239,8 @@ def test_unlikely_and_uncertain_road_users() -> None:
         ({"stop": math.nan}, "stop is NaN"),
         ({"obstacles": rectangle(40, 0)._replace(size=np.array([[4.0, -1.0]]))}, "obstacle 0: its size"),
         ({"obstacles": rectangle(40, 0)._replace(probability=np.array([1.5]))}, "between 0 and 1"),
+        ({"obstacles": rectangle(40, 0)._replace(size=np.array([[4.0, 0.0]]))}, "obstacle 0: its size"),
+        ({"obstacles": rectangle(40, 0)._replace(probability=np.array([-0.5]))}, "between 0 and 1"),
         ({"obstacles": rectangle(40, 0, math.nan)}, "obstacle 0: pose is not finite"),
         ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), [[1, 0.5], [0, 1]]))}, "symmetric"),
         ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), -np.eye(2)))}, "negative eigen"),

@@ -91,6 +91,23 @@ def test_a_place_uncertain_in_one_direction_only_is_met_beside_it_as_if_it_were_
         assert first_rectangle(pose * 1.2, row[None, :, None], 0.0, np.zeros(1), 1.0) == 0, "NaN is not clear"
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_counts_as_far_touches_nothing_however_uncertain(seed: int) -> None:
+    rng, reach = np.random.default_rng(seed), 4.0
+    for _ in range(200):
+        root = rng.normal(0, 1.0, (2, 2)) * [1.0, rng.choice([0.01, 1.0])]
+        pose, size = np.array([[[0.0, 0.0, rng.uniform(-3, 3)]]]), rng.uniform(0.5, 5.0, (1, 2))
+        row = Obstacles(pose, size, (root @ root.T)[None, None], np.ones(1)).table(1e-3, 1.0, reach)[0, :, 0]
+        bearing = rng.uniform(-math.pi, math.pi, 200)
+        far = math.sqrt(row[10]) * np.stack([np.cos(bearing), np.sin(bearing)], -1)
+        assert (margins(row, far * (1 - (reach - 1.0) / math.sqrt(row[10])), 1.0) > -1e-9).all()
+
+
+def test_a_chance_above_one_half_still_keeps_the_distance() -> None:
+    body = Obstacles(np.zeros((1, 1, 3)), np.ones((1, 2)), np.eye(2)[None, None], np.ones(1))
+    assert body.table(0.6, 1.0, 1.0)[0, 9, 0] == 0.0
+
+
 def test_unlikely_objects_get_a_larger_chance_each_and_the_unlikeliest_none() -> None:
     same = Obstacles(
         np.zeros((3, 1, 3)), np.ones((3, 2)), np.full((3, 1, 2, 2), np.eye(2)), np.array([1.0, 0.1, 0.009])
@@ -124,6 +141,24 @@ def test_no_lines_and_lines_far_away_touch_nothing() -> None:
     line = np.array([(0.0, 0.0), (100.0, 0.0)])
     near = boundary([np.array([(0.0, 150.0), (100.0, 150.0)]), line], 1.0, within=(0.0, 0.0, 20.0))
     assert len(near.segment) == 1 and hit(near, 5.0, 0.5, 1.0) and not hit(near, 5.0, 150.0, 1.0)
+
+
+def test_circles_lie_along_the_heading() -> None:
+    lines = tuple(boundary([np.array([(-9.0, 3.0), (9.0, 3.0)])], 1.0)[:6])
+    pose = np.array([[0.0], [0.0], [0.6], [0.8]])  # 53 degrees to the left
+    assert first_line(pose, lines, np.array([0.0, 2.6]), 0.9) == 1
+    assert first_line(pose, lines, np.array([0.0, 2.7]), 0.9) == 0
+    assert first_line(pose * [[1], [1], [1], [-1]], lines, np.array([0.0, 2.7]), 0.9) == 1
+
+
+def test_long_segments_are_kept_where_they_pass_and_the_grid_ends_with_what_is_kept() -> None:
+    line = [np.array([(-40000.0, 0.0), (40000.0, 1.0)])]
+    near = boundary(line, 1.0, within=(0.0, 3.0, 20.0))
+    assert near.shape.prod() < 45 * 10 and hit(near, 5.0, 1.0, 0.6) and not hit(near, 5.0, 1.2, 0.6)
+    past = boundary([np.array([(-400.0, 300.0), (400.0, 300.0)])], 1.0, within=(0.0, 3.0, 20.0))
+    assert not hit(past, 0.0, 0.0, 1.0)
+    with pytest.raises(InputError, match=r"span 80000 by 80000 m.*within"):
+        boundary([np.array([(0.0, 0.0), (8e4, 8e4)])], 1.0)
 
 
 @pytest.mark.parametrize("line", [np.zeros((3, 3)), np.array([(0.0, math.nan), (1.0, 1.0)])])

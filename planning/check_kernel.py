@@ -197,6 +197,7 @@ def judge(  # type: ignore[no-untyped-def]
     num_lateral, num_steps = across.shape[0], across.shape[2]
     speed, curvature = np.empty(num_steps), np.empty(num_steps)
     told, pose = np.empty((3, num_steps)), np.empty((4, num_steps))
+    best = -1
     for c in order:
         i, j = c // num_lateral, c % num_lateral
         a, d = ahead[i], across[j]
@@ -213,6 +214,8 @@ def judge(  # type: ignore[no-untyped-def]
                 if found == GOOD and a[0, num_steps - 1] + a[1, num_steps - 1] ** 2 / (2.0 * braking) > stand:
                     found = BEYOND
         reason[c], when[c] = found, k
-        if first_good and found == GOOD:
-            return c
-    return -1
+        if found == GOOD and best < 0:
+            best = c
+            if first_good:
+                break
+    return best

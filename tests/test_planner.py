@@ -87,6 +87,29 @@ def test_a_vehicle_that_left_its_plan_does_not_get_the_rest_of_it() -> None:
     assert len(with_rest.lateral.cost) == len(moved.lateral.cost) + 1
 
 
+def test_a_rest_told_by_the_way_begins_where_the_vehicle_is() -> None:
+    first = plan(PLANNER, scene(FrenetState(20.0, 2.0, 0.0, 0.4), Keep(2.0)))
+    assert first.lateral.by_way[0]
+    state = first.states([0.6])[0]
+    rest = candidates_of(PLANNER, scene(state, Keep(2.0)), first, 0.6).lateral.motion
+    np.testing.assert_allclose(rest.at([0.0])[-1, 0], (state.d, state.slope, state.bend), atol=1e-12)
+
+
+def test_the_rest_of_a_plan_on_another_line_is_none() -> None:
+    first = plan(PLANNER, scene(START, Keep(12.0)))
+    given = scene(first.states([0.15])[0], Keep(12.0))
+    other = given._replace(line=LINE._replace(table=LINE.table.copy()))
+    here, there = (candidates_of(PLANNER, each, first, 0.15) for each in (given, other))
+    assert len(here.lateral.cost) == len(there.lateral.cost) + 1
+
+
+def test_asking_for_all_reasons_changes_no_plan() -> None:
+    given = scene(START, Keep(12.0), obstacles=rectangle(50.0, 1.0))
+    some, every = plan(PLANNER, given), plan(PLANNER, given, all_reasons=True)
+    assert (every.candidates.reason >= 0).all() and (some.candidates.reason < 0).any()
+    assert (some.cost, some.rejected) == (every.cost, every.rejected) and some.rejected
+
+
 def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) -> str:
     """The reason of a candidate by numpy, formula by formula."""
     i, j = divmod(c, len(found.lateral.cost))

@@ -89,7 +89,7 @@ def test_a_vehicle_that_left_its_plan_does_not_get_the_rest_of_it() -> None:
 
 def test_a_rest_told_by_the_way_begins_where_the_vehicle_is() -> None:
     first = plan(PLANNER, scene(FrenetState(20.0, 2.0, 0.0, 0.4), Keep(2.0)))
-    assert first.lateral.by_way[0]
+    assert first.lateral.by_way[0] and first.states([0.0])[0].d == pytest.approx(0.4, abs=1e-12)
     state = first.states([0.6])[0]
     rest = candidates_of(PLANNER, scene(state, Keep(2.0)), first, 0.6).lateral.motion
     np.testing.assert_allclose(rest.at([0.0])[-1, 0], (state.d, state.slope, state.bend), atol=1e-12)
@@ -280,8 +280,9 @@ def test_limits_that_contradict_are_refused() -> None:
         Planner(comfort=Limits(braking=9.0))
     with pytest.raises(InputError, match=r"comfort.curvature_rate is 0.5, more than the vehicle can"):
         Planner(comfort=Limits(curvature_rate=0.5))
-    with pytest.raises(InputError, match="speed is -1"):
-        Limits(speed=-1.0)
+    for value in (-1.0, 0.0, math.inf, math.nan):
+        with pytest.raises(InputError, match=f"limits: power is {value}"):
+            Limits(power=value)
     with pytest.raises(InputError, match="vehicle: length is 0"):
         Vehicle(length=0.0)
 

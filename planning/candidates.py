@@ -15,12 +15,14 @@ motion at the speed v where both ways of telling meet: T = W / v, int(d'''(t)^2 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from models.program import InputError
 from planning.frenet import FrenetState
 from planning.polynomials import Polynomials, quartics, quintics, squared_jerk
 
@@ -41,6 +43,11 @@ class Weights:
     longitudinal: float = 1.0
     lateral: float = 1.0
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 <= value < math.inf:
+                raise InputError(f"weights: {name} is {value}, but must be 0 or more and finite")
+
 
 class Keep(NamedTuple):
     """Drive at a speed [m/s]."""
@@ -55,20 +62,22 @@ class Keep(NamedTuple):
 class Reach(NamedTuple):
     """Be at a place that moves: s(t) = place + speed t + acceleration t^2 / 2, speed never below 0 [m, s].
 
-    behind  how far short of it an end may fall; past: how far beyond it [m]"""
+    behind  how far short of it an end may fall; past: how far beyond it [m]
+    until   when it stands still at the latest [s]"""
 
     place: float
     speed: float = 0.0
     acceleration: float = 0.0
     behind: float = 6.0
     past: float = 2.0
+    until: float = math.inf
 
     def target(self, time: ArrayLike) -> tuple[Floats, Floats]:
         """Place and speed at times; a target that brakes stands still in the end."""
-        t: Floats = np.asarray(time, float)
-        if self.acceleration < 0:
-            t = np.minimum(t, self.speed / -self.acceleration)
-        speed = self.speed + self.acceleration * t
+        given = np.asarray(time, float)
+        end = min(self.until, self.speed / -self.acceleration if self.acceleration < 0 else math.inf)
+        t: Floats = np.minimum(given, end)
+        speed = np.where(given < end, self.speed + self.acceleration * t, 0.0)
         return self.place + self.speed * t + self.acceleration * t**2 / 2, speed
 
     def costs(self, place: Floats, speed: Floats, time: Floats) -> Floats:
@@ -82,9 +91,11 @@ Goal = Keep | Reach
 
 def follow(rear: float, speed: float, acceleration: float, front: float, *, gap: float, headway: float) -> Reach:
     """Behind a lead vehicle whose rear is at `rear`: gap + headway * its speed short of it with one's own front, which
-    is `front` ahead of the reference point."""
-    wanted = speed - headway * acceleration
-    return Reach(rear - front - gap - headway * speed, max(wanted, 0.0), acceleration)
+    is `front` ahead of the reference point. It stands still when the lead vehicle does."""
+    wanted, until = speed - headway * acceleration, math.inf
+    if acceleration < 0:
+        until = max(speed, 0.0) / -acceleration
+    return Reach(rear - front - gap - headway * speed, max(wanted, 0.0), acceleration, until=until)
 
 
 def stop(place: float, front: float) -> Reach:
@@ -94,7 +105,7 @@ def stop(place: float, front: float) -> Reach:
 
 def merge(ahead: tuple[float, float], behind: tuple[float, float]) -> Reach:
     """Midway between two vehicles, each (s [m], speed [m/s])."""
-    return Reach((ahead[0] + behind[0]) / 2, (ahead[1] + behind[1]) / 2)
+    return Reach((ahead[0] + behind[0]) / 2, max((ahead[1] + behind[1]) / 2, 0.0))
 
 
 @dataclass(frozen=True)
@@ -119,6 +130,21 @@ class Fans:
     num_places: int = 9
     ways: tuple[float, ...] = (4.0, 6.0, 9.0, 13.0, 18.0)
     slow: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in ("cycle", "soonest", "slow"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise InputError(f"fans: {name} is {getattr(self, name)}, but must be positive and finite")
+        if round(self.soonest / self.cycle) < 1:
+            raise InputError(f"fans: soonest is {self.soonest}, less than half a cycle of {self.cycle} s")
+        for name in ("latest", "latest_speed", "latest_place"):
+            if not self.soonest <= getattr(self, name) < math.inf:
+                raise InputError(f"fans: {name} is {getattr(self, name)}, sooner than soonest, {self.soonest}")
+        for name in ("num_speeds", "num_places"):
+            if getattr(self, name) < 1:
+                raise InputError(f"fans: {name} is {getattr(self, name)}, but must be 1 or more")
+        if not self.ways or not all(0.0 < way < math.inf for way in self.ways):
+            raise InputError(f"fans: ways are {self.ways}, but must be one or more positive lengths [m]")
 
     def times(self, latest: float) -> Floats:
         """On the grid of cycles."""

@@ -151,33 +151,22 @@ def first_rectangle(pose, rectangles, middle, circles, radius):  # type: ignore[
         r, near = rectangles[m], 0
         for k in range(first):  # on vectors: most are far away
             dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
-            near += 1 if dx * dx + dy * dy <= r[10, k] else 0
+            near += 0 if dx * dx + dy * dy > r[10, k] else 1
         if near == 0:
             continue
         for k in range(first):
             dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
             if dx * dx + dy * dy > r[10, k]:
                 continue
-            least = 1.0
+            clear = True
             for n in range(len(circles)):
                 x, y = pose[0, k] + circles[n] * pose[2, k], pose[1, k] + circles[n] * pose[3, k]
-                clear = clearance_of(
-                    x,
-                    y,
-                    r[0, k],
-                    r[1, k],
-                    r[2, k],
-                    r[3, k],
-                    r[4, k],
-                    r[5, k],
-                    r[6, k],
-                    r[7, k],
-                    r[8, k],
-                    r[9, k],
+                margin = clearance_of(
+                    x, y, r[0, k], r[1, k], r[2, k], r[3, k], r[4, k], r[5, k], r[6, k], r[7, k], r[8, k], r[9, k],
                     radius,
-                )
-                least = min(least, clear[0])
-            if least <= 0.0:
+                )  # fmt: skip
+                clear &= margin[0] > 0.0  # NaN is not clear
+            if not clear:
                 first = k
                 break
     return first
@@ -215,6 +204,7 @@ def judge(  # type: ignore[no-untyped-def]
     num_lateral, num_steps = across.shape[0], across.shape[2]
     speed, curvature = np.empty(num_steps), np.empty(num_steps)
     told, pose = np.empty((3, num_steps)), np.empty((4, num_steps))
+    best = -1
     for c in order:
         i, j = c // num_lateral, c % num_lateral
         a, d = ahead[i], across[j]
@@ -231,6 +221,8 @@ def judge(  # type: ignore[no-untyped-def]
                 if found == GOOD and a[0, num_steps - 1] + a[1, num_steps - 1] ** 2 / (2.0 * braking) > stand:
                     found = BEYOND
         reason[c], when[c] = found, k
-        if first_good and found == GOOD:
-            return c
-    return -1
+        if found == GOOD and best < 0:
+            best = c
+            if first_good:
+                break
+    return best

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.program import InputError
-from planning.kinematics import KINEMATICS, NARROWEST
+from planning.kinematics import KINEMATICS
 from planning.polynomials import NOTHING
 from planning.reference import ReferenceLine
 from planning.reference_kernel import BEYOND_ENDS, FOUND
@@ -73,8 +73,6 @@ def to_frenet(line: ReferenceLine, pose: Pose, start: float | None = None) -> Fr
             f"the vehicle heads {math.degrees(turned):.0f} degrees away from the line at s {s:.1f} m; "
             f"choose a line that runs its way (within {math.degrees(STEEPEST):.0f} degrees)"
         )
-    if w < NARROWEST:
-        raise InputError(f"the vehicle is {d:.1f} m off the line, near its centre of curvature, at s {s:.1f} m")
     slope = w * math.tan(turned)
     n = w / math.cos(turned)  # way per arc length
     narrowing = -(rate * d + kappa * slope)  # dw/ds

@@ -2,7 +2,7 @@
 
     comfort      the cheapest candidate within the vehicle's comfortable limits, clear of everything
     relaxed      the same within what the vehicle can do
-    emergency    a stop: the cheapest that is clear, else the one that is slowest where it touches something
+    emergency    a stop: the cheapest that is clear, else the one that does least harm
 
 [K15], section IV-C: horizon 3 s, 20 Hz, every 150 ms; |a_lat| <= 2 m/s^2.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +30,8 @@ from planning.shapes import Boundary, Obstacles, Vehicle, check_obstacles
 Floats = NDArray[np.float64]
 COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
 ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
+ANY = Limits(*(1e9,) * 7)  # no limits but those of geometry
+LARGEST = 1e6  # of what a state or a goal tells: powers of more overflow
 SLOWEST = 0.05  # [m/s] above which a motion told by time tells a direction
 
 
@@ -46,7 +48,9 @@ class Planner:
     vehicle: Vehicle = field(default_factory=Vehicle)
     comfort: Limits = field(default_factory=Limits)
     able: Limits = field(
-        default_factory=lambda: Limits(acceleration=4.0, braking=8.0, lateral_acceleration=5.0, curvature_rate=0.4)
+        default_factory=lambda: Limits(
+            speed=60.0, acceleration=4.0, braking=8.0, lateral_acceleration=5.0, curvature_rate=0.4
+        )
     )
     weights: Weights = field(default_factory=Weights)
     fans: Fans = field(default_factory=Fans)
@@ -59,14 +63,18 @@ class Planner:
         for name in ("horizon", "step", "risk"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"planner: {name} is {getattr(self, name)}, but must be positive and finite")
-        for name in LIMITS:
+        if self.num_steps < 1:
+            raise InputError(f"planner: a horizon of {self.horizon} s has no step of {self.step} s")
+        if self.risk >= 1.0:
+            raise InputError(f"planner: risk is {self.risk}, but is a probability below 1")
+        for name in (*LIMITS, "curvature_rate"):
             if getattr(self.able, name) < getattr(self.comfort, name):
                 raise InputError(
                     f"planner: comfort.{name} is {getattr(self.comfort, name)}, more than the vehicle can: "
                     f"able.{name} is {getattr(self.able, name)}"
                 )
-        if self.margin < 0:
-            raise InputError(f"planner: margin is {self.margin}, but must be 0 or more [m]")
+        if not 0.0 <= self.margin < math.inf:
+            raise InputError(f"planner: margin is {self.margin}, but must be 0 or more and finite [m]")
 
     @property
     def num_steps(self) -> int:
@@ -134,8 +142,18 @@ class Plan(NamedTuple):
     candidates: Candidates
 
     def along(self, t: Floats) -> Floats:
-        """s, s', s'' (K, 3), never backwards."""
-        return forwards(self.longitudinal.at(t)[0])
+        """s, s', s'' (K, 3), never backwards: it stands where the motion turns, until that is back."""
+        told = self.longitudinal.at(t)[0]
+        speed = np.polynomial.Polynomial(self.longitudinal.coefficients[0]).deriv()
+        roots = np.asarray(speed.roots(), complex)
+        turns: Floats = np.sort(roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real)
+        turns = np.r_[0.0, turns[(turns > 0.0) & (turns < self.longitudinal.duration[0])]]
+        farthest = np.maximum.accumulate(self.longitudinal.at(turns)[0, :, 0])
+        farthest = farthest[np.searchsorted(turns, t, side="right") - 1]
+        still = (told[:, 1] < 0.0) | (farthest > told[:, 0])
+        told[still, 0] = np.maximum(farthest, told[:, 0])[still]
+        told[still, 1:] = 0.0
+        return told
 
     def states(self, t: Sequence[float] | Floats) -> list[FrenetState]:
         """Where the vehicle is along the line at times t after the start."""
@@ -189,7 +207,7 @@ def plan(
     if relaxed.best >= 0:
         return chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
     stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able)
-    best = stops.best if stops.best >= 0 else least_harm(planner, stops)
+    best = stops.best if stops.best >= 0 else least_harm(planner, scene, stops)
     return chosen(scene, stops, best, EMERGENCY, rejected)
 
 
@@ -197,7 +215,7 @@ def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, 
     """All motions of a scene, and the rest of the previous plan if the vehicle is where that plan wanted it."""
     rest = _rest(scene, previous, elapsed)
     ahead = candidates.longitudinal(
-        scene.state, scene.goal, planner.fans, planner.weights, None if rest is None else rest[0]
+        _started(scene.state), scene.goal, planner.fans, planner.weights, None if rest is None else rest[0]
     )
     across = candidates.lateral(
         scene.state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
@@ -206,17 +224,26 @@ def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, 
 
 
 def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elapsed: float) -> Candidates:
-    """Stops within what the vehicle can do, from as hard as that on, on any lateral motion.
+    """Stops within what the vehicle can do, from as hard as that on, on lateral motions told by time and by the way.
 
-    A quartic from v to rest in T brakes by 3 v / 2 T at most (from a = 0)."""
-    state, rest = scene.state, _rest(scene, previous, elapsed)
-    shortest = max(1.5 * state.ds / planner.able.braking, planner.fans.cycle)
-    duration = shortest * np.array([1.0, 1.15, 1.4, 1.8, 2.5, 4.0])
+    A quartic from speed v and acceleration a to rest in T brakes by (3 v + a T)^2 / (3 T (2 v + a T)) at most, which is
+    b at T = 3 v / (b - a + sqrt(b (b + a))); where a < 0 it stays positive up to T = 3 v / -a. A path that is told by
+    the way is the same however hard one brakes on it."""
+    state, rest, braking = _started(scene.state), _rest(scene, previous, elapsed), planner.able.braking
+    v, a = max(state.ds, SLOWEST), min(max(state.dds, -braking), braking)
+    shortest = 3.0 * v / (braking - a + math.sqrt(braking * (braking + a)))
+    longest = 3.0 * v / max(-state.dds, 1e-9)
+    duration = np.unique(np.minimum(shortest * np.array([1.0, 1.05, 1.15, 1.4, 1.8, 2.5, 4.0]), longest))
     motion = quartics((state.s, state.ds, state.dds), np.zeros_like(duration), duration)
     ahead = Longitudinal(motion, candidates.longitudinal_cost(motion, Keep(0.0), planner.weights))
+    fans = planner.fans
     across = candidates.lateral(
-        state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
+        state, scene.offsets, scene.wanted, fans, planner.weights, None if rest is None else rest[1]
     )
+    if state.ds >= fans.slow:
+        pace = state.ds / fans.slow
+        steady = replace(fans, ways=tuple(pace * way for way in fans.ways), slow=math.nextafter(state.ds, math.inf))
+        across = candidates.lateral(state, scene.offsets, scene.wanted, steady, planner.weights, across)
     return combined(planner, ahead, across)
 
 
@@ -315,16 +342,24 @@ def turned_down(judged: Candidates) -> dict[str, int]:
 def check(planner: Planner, scene: Scene) -> None:
     """Raises InputError for a scene that no plan can be made for, in words."""
     for name, value in zip(scene.state._fields, scene.state, strict=True):
-        if not math.isfinite(value):
+        if not abs(value) < LARGEST:
             raise InputError(f"the vehicle's state has {name} = {value}")
     if not 0.0 <= scene.state.s <= scene.line.length:
         raise InputError(
             f"the vehicle is at s {scene.state.s:.1f} m of a line from 0 to {scene.line.length:.1f} m; "
             "choose a longer one"
         )
-    if not all(map(math.isfinite, scene.goal)):
-        raise InputError(f"the goal {scene.goal} is not finite")
-    if not len(scene.offsets) or not np.isfinite(scene.offsets).all() or not math.isfinite(scene.wanted):
+    for name, value in zip(scene.goal._fields, scene.goal, strict=True):
+        if not (abs(value) < LARGEST or (name == "until" and value == math.inf)):
+            raise InputError(f"the goal {scene.goal} is not finite, or out of this world")
+    if scene.goal.speed < 0.0:
+        raise InputError(f"the goal {scene.goal} has a negative speed; 0 stands still")
+    if (
+        np.ndim(scene.offsets) != 1
+        or not len(scene.offsets)
+        or not np.isfinite(scene.offsets).all()
+        or not math.isfinite(scene.wanted)
+    ):
         raise InputError(
             f"offsets to drive to are {np.asarray(scene.offsets).tolist()}, but must be one or more numbers"
         )
@@ -351,6 +386,11 @@ def _rest(scene: Scene, previous: Plan | None, elapsed: float) -> tuple[Polynomi
     return previous.longitudinal.later(elapsed), lateral._replace(motion=lateral.motion.later(gone))
 
 
+def _started(state: FrenetState) -> FrenetState:
+    """At rest nothing brakes: a small deceleration that is measured there would forbid every motion as backwards."""
+    return state._replace(dds=max(state.dds, 0.0)) if state.ds < SLOWEST else state
+
+
 def combined(planner: Planner, ahead: Longitudinal, across: Lateral) -> Candidates:
     weights = planner.weights
     cost = (weights.longitudinal * ahead.cost[:, None] + weights.lateral * across.cost).ravel()
@@ -358,15 +398,18 @@ def combined(planner: Planner, ahead: Longitudinal, across: Lateral) -> Candidat
     return Candidates(ahead, across, cost, np.argsort(cost, kind="stable"), unseen, unseen, -1)
 
 
-def least_harm(planner: Planner, judged: Candidates) -> int:
-    """Of candidates that are all bad: one that can be driven, then the slowest at the step that breaks something, then
-    the cheapest."""
-    from planning.check_kernel import BOUNDARY
+def least_harm(planner: Planner, scene: Scene, judged: Candidates) -> int:
+    """Of stops that are all bad: one that can be driven, then the slowest where it touches something or leaves the line
+    (0 where it does not: passing a stop point touches nothing), then the shortest, then the cheapest."""
+    from planning.check_kernel import END_OF_LINE, GOOD
 
-    t = planner.step * np.arange(1, planner.num_steps + 2)
-    speed = judged.longitudinal.motion.at(t)[..., 1]
+    passing = judge(planner, scene._replace(stop=math.inf, stand=math.inf), judged, ANY, first_good=False)
+    told = judged.longitudinal.motion.at(planner.step * np.arange(1, planner.num_steps + 2))
     i = np.arange(judged.cost.size) // len(judged.lateral.cost)
-    return int(np.lexsort((judged.cost, speed[i, judged.when], judged.reason < BOUNDARY))[0])
+    speed = np.where(passing.reason < END_OF_LINE, math.inf, told[i, passing.when, 1])
+    speed[passing.reason == GOOD] = 0.0
+    driven = (judged.reason == GOOD) | (judged.reason >= END_OF_LINE)
+    return int(np.lexsort((judged.cost, told[i, -1, 0], speed, ~driven))[0])
 
 
 def chosen(scene: Scene, judged: Candidates, best: int, tier: str, rejected: dict[str, int]) -> Plan:

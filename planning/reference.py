@@ -8,6 +8,7 @@ left.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -68,12 +69,20 @@ class ReferenceLine(NamedTuple):
 def from_curvature(
     s: ArrayLike, kappa: ArrayLike, start: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> ReferenceLine:
-    """From (x, y, theta) = start, with curvature through kappa (N,) at s (N,) as a cubic spline."""
+    """From (x, y, theta) = start, with curvature through kappa (N,) at s (N,) as a cubic spline, up to the last
+    multiple of STEP. Raises InputError for NaN, and arc lengths that do not rise from 0."""
     from scipy.interpolate import CubicSpline
 
-    curve = CubicSpline(np.asarray(s, float), np.asarray(kappa, float))
+    s, kappa = np.asarray(s, float), np.asarray(kappa, float)
+    if s.ndim != 1 or s.shape != kappa.shape or len(s) < 2 or s[0] != 0.0 or not (np.diff(s) > 0.0).all():
+        raise InputError("a line from curvature needs arc lengths that rise from 0, and as many curvatures")
+    if not (np.isfinite(kappa).all() and s[-1] < math.inf):
+        raise InputError("a line from curvature: curvatures and arc lengths must be finite")
+    curve = CubicSpline(s, kappa)
     turned = curve.antiderivative()
-    rows = np.arange(0.0, curve.x[-1] + STEP / 2, STEP)
+    rows = STEP * np.arange(math.floor(s[-1] / STEP + 1e-9) + 1)
+    if len(rows) < 2:
+        raise InputError(f"a line from curvature is {s[-1]} m long, shorter than {STEP} m")
     nodes, weights = np.polynomial.legendre.leggauss(6)
     theta = start[2] + turned(rows[:-1, None] + (nodes + 1) * STEP / 2)
     x, y = (np.r_[0.0, np.cumsum(f(theta) @ weights * STEP / 2)] for f in (np.cos, np.sin))

@@ -25,6 +25,7 @@ from models.formula import Formula
 from models.program import InputError
 
 Floats = NDArray[np.float64]
+MOST_CELLS = 20_000_000  # of that grid: some 4 km by 4 km
 CELL = 1.0  # of the grid in which segments of boundary lines are found [m]
 
 
@@ -41,6 +42,8 @@ class Vehicle:
         for name in ("length", "width", "num_circles"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"vehicle: {name} is {getattr(self, name)}, but must be positive and finite")
+        if not math.isfinite(self.middle) or self.num_circles != int(self.num_circles):
+            raise InputError(f"vehicle: middle is {self.middle} and num_circles {self.num_circles}: a length, a number")
 
     @property
     def front(self) -> float:
@@ -65,10 +68,10 @@ def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
     qx = ahead - ops.fmin(ops.fmax(ahead, -half_length), half_length)
     qy = left - ops.fmin(ops.fmax(left, -half_width), half_width)
     squared = qx * qx + qy * qy
-    spread = qx * qx * along + 2 * qx * qy * mixed + qy * qy * across
+    spread = ops.fmax(qx * qx * along + 2 * qx * qy * mixed + qy * qy * across, 0.0)  # of a flat one, to rounding
     root = ops.sqrt(squared)
-    beside = ops.fabs(left) - half_width - radius - z * ops.sqrt(across)
-    beyond = ops.fabs(ahead) - half_length - radius - z * ops.sqrt(along)
+    beside = ops.fabs(left) - half_width - radius - z * ops.sqrt(ops.fmax(across, 0.0))
+    beyond = ops.fabs(ahead) - half_length - radius - z * ops.sqrt(ops.fmax(along, 0.0))
     return (ops.fmax(squared - radius * root - z * ops.sqrt(spread), root * ops.fmax(beside, beyond)),)
 
 
@@ -143,7 +146,7 @@ class Obstacles(NamedTuple):
         across = sin**2 * S[..., 0, 0] - 2 * cos * sin * S[..., 0, 1] + cos**2 * S[..., 1, 1]
         mixed = cos * sin * (S[..., 1, 1] - S[..., 0, 0]) + (cos**2 - sin**2) * S[..., 0, 1]
         half = np.broadcast_to(size[:, None] / 2, (*cos.shape, 2))
-        widest = z * np.sqrt(np.linalg.eigvalsh(S)[..., 1]) if len(S) else np.zeros_like(cos)
+        widest = z * np.sqrt(np.maximum(np.linalg.eigvalsh(S)[..., 1], 0.0)) if len(S) else np.zeros_like(cos)
         near = (np.hypot(half[..., 0], half[..., 1]) + reach + widest) ** 2
         told = [pose[..., 0], pose[..., 1], cos, sin, half[..., 0], half[..., 1], along, mixed, across]
         return np.ascontiguousarray(np.stack([*told, np.broadcast_to(z, cos.shape), near], 1))
@@ -155,8 +158,8 @@ def no_obstacles(num_steps: int) -> Obstacles:
 
 
 def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
-    """Raises InputError for wrong shapes, NaN, sizes that are not positive, covariances with negative eigenvalues, and
-    probabilities outside [0, 1]."""
+    """Raises InputError for wrong shapes, NaN, sizes that are not positive, covariances that are not symmetric or have
+    negative eigenvalues, and probabilities outside [0, 1]."""
     num = len(obstacles.pose)
     wanted = {
         "pose": (num, num_steps, 3),
@@ -173,7 +176,11 @@ def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
             raise InputError(f"obstacle {first}: {name} is not finite")
     for which in np.flatnonzero((obstacles.size <= 0).any(1)):
         raise InputError(f"obstacle {which}: its size is {obstacles.size[which].tolist()}, but must be positive [m]")
-    if num and (np.linalg.eigvalsh(obstacles.covariance) < -1e-9).any():
+    S = obstacles.covariance
+    crooked = np.abs(S[..., 0, 1] - S[..., 1, 0]) > 1e-9 * (1 + np.abs(S[..., 0, 1]))
+    for which in np.flatnonzero(crooked.any(1)):
+        raise InputError(f"obstacle {which}: its covariance is not symmetric")
+    if num and (np.linalg.eigvalsh(S) < -1e-9).any():
         raise InputError("obstacles: a covariance has a negative eigenvalue")
     if ((obstacles.probability < 0) | (obstacles.probability > 1)).any():
         raise InputError(f"obstacles: probabilities are {obstacles.probability.tolist()}, but lie between 0 and 1")
@@ -202,7 +209,7 @@ class Boundary(NamedTuple):
 def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, float, float] | None = None) -> Boundary:
     """Of lines, each (N, 2) points [m]; `within` keeps what is nearer than r to (x, y): (x, y, r).
 
-    Raises InputError for NaN and wrong shapes."""
+    Raises InputError for NaN, wrong shapes, and lines that span more than MOST_CELLS cells."""
     from planning.boundary_kernel import bucket
 
     parts = [np.zeros((0, 4))]
@@ -220,7 +227,16 @@ def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, f
         none = np.zeros(0, np.int64)
         return Boundary(segment, np.zeros(2), np.zeros(2, np.int64), np.zeros(1, np.int64), none, CELL, reach)
     ends = segment.reshape(-1, 2)
-    origin = ends.min(0) - reach - CELL
-    shape = np.ceil((ends.max(0) + reach + CELL - origin) / CELL).astype(np.int64)
+    lower, upper = ends.min(0), ends.max(0)
+    if within is not None:
+        x, y, r = within
+        lower, upper = np.maximum(lower, [x - r, y - r]), np.minimum(upper, [x + r, y + r])
+        upper = np.maximum(lower, upper)  # a long segment may be kept that passes by
+    origin = lower - reach - CELL
+    cells = np.ceil((upper + reach + CELL - origin) / CELL)
+    if cells.prod() > MOST_CELLS:
+        span = " by ".join(f"{width:.0f}" for width in upper - lower)
+        raise InputError(f"boundary lines span {span} m, too much for one grid; keep what is near by `within`")
+    shape = cells.astype(np.int64)
     offset, member = bucket(segment, origin, shape, CELL, reach)
     return Boundary(np.ascontiguousarray(segment), origin, shape, offset, member, CELL, reach)

@@ -50,6 +50,7 @@ def test_all_backends_agree(name: str) -> None:
 def test_one_row_of_parameters_serves_all_points() -> None:
     formula = Formula("scaled", lambda x, p, ops: (x[0] * p[0],), 2, 1)
     np.testing.assert_array_equal(formula(POINTS, np.array([[3.0]])), 3.0 * POINTS[:, :1])
+    np.testing.assert_array_equal(formula(POINTS[:2], np.array([[3.0], [4.0]])), [[3.0], [4.0]] * POINTS[:2, :1])
 
 
 UNARY = ("sin cos tan tanh exp log sqrt erf asin acos atan sinh cosh log1p expm1 floor ceil fabs sign").split()

@@ -119,11 +119,18 @@ def test_a_standing_vehicle_keeps_its_direction() -> None:
     np.testing.assert_allclose(to_pose(LINE, to_frenet(LINE, pose, 30.0)), pose, atol=1e-7)
 
 
+def test_headings_come_back_whatever_their_turns() -> None:
+    pose = Pose(*map(float, LINE.place(30.0, 1.0)), float(LINE.at(30.0)[2]) + 0.3, 3.0, 0.2, 0.05)
+    turned = to_frenet(LINE, pose._replace(heading=pose.heading - 4 * math.pi), 30.0)
+    np.testing.assert_allclose(turned, to_frenet(LINE, pose, 30.0), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("pose", "words"),
     [
         (Pose(math.nan, 0.0, 0.0, 1.0), "not finite"),
         (Pose(-20.0, -20.0, 0.7, 1.0), "before or after the line"),
+        (Pose(*map(float, LINE.place(30.0, 0.0)), float(LINE.at(30.0)[2]) - 1.5, 1.0), "heads -86 degrees away"),
         (Pose(*map(float, LINE.place(30.0, 0.0)), float(LINE.at(30.0)[2]) + 2.0, 1.0), "heads 115 degrees away"),
     ],
 )
@@ -145,6 +152,7 @@ def test_what_is_left_of_a_polynomial_is_the_same_motion() -> None:
     motion = quintics((1.0, 2.0, 0.5), [(9.0, 1.0, 0.0), (3.0, 0.5, 0.0)], [2.0, 0.5])
     t = np.array([0.0, 0.3, 1.2, 2.0])
     np.testing.assert_allclose(motion.later(0.6).at(t)[:, 1:], motion.at(t + 0.6)[:, 1:], atol=1e-12)
+    np.testing.assert_allclose(motion.later(0.6).duration, [1.4, 0.0], atol=1e-12)
     np.testing.assert_allclose(motion.later(0.6).at(t)[:, 0, :2], motion.at(t + 0.6)[:, 0, :2], atol=1e-12)
 
 

@@ -87,6 +87,29 @@ def test_a_vehicle_that_left_its_plan_does_not_get_the_rest_of_it() -> None:
     assert len(with_rest.lateral.cost) == len(moved.lateral.cost) + 1
 
 
+def test_a_rest_told_by_the_way_begins_where_the_vehicle_is() -> None:
+    first = plan(PLANNER, scene(FrenetState(20.0, 2.0, 0.0, 0.4), Keep(2.0)))
+    assert first.lateral.by_way[0] and first.states([0.0])[0].d == pytest.approx(0.4, abs=1e-12)
+    state = first.states([0.6])[0]
+    rest = candidates_of(PLANNER, scene(state, Keep(2.0)), first, 0.6).lateral.motion
+    np.testing.assert_allclose(rest.at([0.0])[-1, 0], (state.d, state.slope, state.bend), atol=1e-12)
+
+
+def test_the_rest_of_a_plan_on_another_line_is_none() -> None:
+    first = plan(PLANNER, scene(START, Keep(12.0)))
+    given = scene(first.states([0.15])[0], Keep(12.0))
+    other = given._replace(line=LINE._replace(table=LINE.table.copy()))
+    here, there = (candidates_of(PLANNER, each, first, 0.15) for each in (given, other))
+    assert len(here.lateral.cost) == len(there.lateral.cost) + 1
+
+
+def test_asking_for_all_reasons_changes_no_plan() -> None:
+    given = scene(START, Keep(12.0), obstacles=rectangle(50.0, 1.0))
+    some, every = plan(PLANNER, given), plan(PLANNER, given, all_reasons=True)
+    assert (every.candidates.reason >= 0).all() and (some.candidates.reason < 0).any()
+    assert (some.cost, some.rejected) == (every.cost, every.rejected) and some.rejected
+
+
 def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) -> str:
     """The reason of a candidate by numpy, formula by formula."""
     i, j = divmod(c, len(found.lateral.cost))
@@ -242,12 +265,22 @@ def test_unlikely_and_uncertain_road_users() -> None:
         ({"state": START._replace(ds=math.nan)}, "ds = nan"),
         ({"state": START._replace(s=400.0)}, "choose a longer one"),
         ({"goal": Reach(math.inf)}, "not finite"),
+        ({"goal": Reach(50.0, until=math.nan)}, "not finite"),
+        ({"goal": Keep(-1.0)}, "negative speed"),
+        ({"state": START._replace(s=-0.1)}, "choose a longer one"),
+        ({"offsets": np.zeros((2, 2))}, "one or more numbers"),
+        ({"wanted": math.nan}, "one or more numbers"),
+        ({"stand": math.nan}, "stand is NaN"),
         ({"offsets": np.zeros(0)}, "one or more numbers"),
         ({"boundary": boundary([], 0.5)}, "build them with that reach"),
         ({"stop": math.nan}, "stop is NaN"),
         ({"obstacles": rectangle(40, 0)._replace(size=np.array([[4.0, -1.0]]))}, "obstacle 0: its size"),
         ({"obstacles": rectangle(40, 0)._replace(probability=np.array([1.5]))}, "between 0 and 1"),
+        ({"obstacles": rectangle(40, 0)._replace(size=np.array([[4.0, 0.0]]))}, "obstacle 0: its size"),
+        ({"obstacles": rectangle(40, 0)._replace(probability=np.array([-0.5]))}, "between 0 and 1"),
         ({"obstacles": rectangle(40, 0, math.nan)}, "obstacle 0: pose is not finite"),
+        ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), [[1, 0.5], [0, 1]]))}, "symmetric"),
+        ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), -np.eye(2)))}, "negative eigen"),
         ({"obstacles": no_obstacles(7)}, "must be \\(0, 60, 3\\)"),
     ],
 )
@@ -259,8 +292,11 @@ def test_scenes_that_are_none_are_refused_in_words(change: dict[str, Any], words
 def test_limits_that_contradict_are_refused() -> None:
     with pytest.raises(InputError, match=r"comfort.braking is 9.0, more than the vehicle can: able.braking is 8.0"):
         Planner(comfort=Limits(braking=9.0))
-    with pytest.raises(InputError, match="speed is -1"):
-        Limits(speed=-1.0)
+    with pytest.raises(InputError, match=r"comfort.curvature_rate is 0.5, more than the vehicle can"):
+        Planner(comfort=Limits(curvature_rate=0.5))
+    for value in (-1.0, 0.0, math.inf, math.nan):
+        with pytest.raises(InputError, match=f"limits: power is {value}"):
+            Limits(power=value)
     with pytest.raises(InputError, match="vehicle: length is 0"):
         Vehicle(length=0.0)
 

@@ -47,6 +47,44 @@ def test_the_table_is_consistent() -> None:
         np.testing.assert_allclose(slope[:, 3], told[:, 4], atol=1e-3)
 
 
+def test_curvature_and_its_slope_are_those_given() -> None:
+    s = np.linspace(0.0, 200.0, 3001)
+    told = winding(0.05, 12.0).at(s)
+    np.testing.assert_allclose(told[:, 3], 0.05 * np.sin(s / 12.0), atol=1e-7)
+    np.testing.assert_allclose(told[:, 4], 0.05 / 12.0 * np.cos(s / 12.0), atol=4e-6)
+
+
+def test_beyond_its_ends_a_line_goes_on() -> None:
+    line = from_curvature([0.0, 5.0, 10.1], [0.0, 0.0, 0.0])
+    assert line.length == 10.0
+    np.testing.assert_allclose(
+        line.at([-3.0, 10.0, 12.0])[:, :4], [[-3, 0, 0, 0], [10, 0, 0, 0], [12, 0, 0, 0]], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("num", [3, 4, 5])
+def test_a_few_points_make_a_line(num: int) -> None:
+    line = from_points(circle(20.0, 1.0, num), std=0.0)
+    assert line.length == pytest.approx(20.0, abs=0.2) and np.isfinite(line.table).all()
+    assert line.at(10.0)[3] == pytest.approx(1 / 20.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("s", "kappa"),
+    [([0, 1, 2], [0, math.nan, 0]), ([1, 2, 3], [0, 0, 0]), ([0, 2, 1], [0, 0, 0]), ([0, 1], [0, 0, 0]),
+     ([0, 0.1], [0, 0]), ([0, math.nan], [0, 0]), ([0, math.inf], [0, 0])],
+)  # fmt: skip
+def test_curvatures_that_make_no_line_are_refused(s: list[float], kappa: list[float]) -> None:
+    with pytest.raises(InputError, match="a line from curvature"):
+        from_curvature(s, kappa)
+
+
+@pytest.mark.parametrize("std", [-0.1, math.nan])
+def test_errors_of_points_are_not_negative(std: float) -> None:
+    with pytest.raises(InputError, match="std is"):
+        from_points(circle(20.0), std=std)
+
+
 def test_smoothing_takes_noise_away() -> None:
     noisy = circle(30.0, 3.0, 120) + np.random.default_rng(1).normal(0, 0.1, (120, 2))
     told = from_points(noisy, std=0.1).at(np.linspace(5, 85, 100))

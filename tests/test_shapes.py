@@ -13,6 +13,7 @@ from shapely import affinity
 
 from models.program import InputError
 from planning.boundary_kernel import first_line
+from planning.check_kernel import first_rectangle
 from planning.shapes import CLEARANCE, OUTLINE, ROUND, Boundary, Obstacles, Vehicle, boundary, outlines
 
 VEHICLE = Vehicle()
@@ -74,6 +75,39 @@ def test_a_chance_constraint_at_its_limit_is_kept_in_simulation() -> None:
                 assert rate > 0.02, "a straight side is met about as often as allowed"
 
 
+def test_a_place_uncertain_in_one_direction_only_is_met_beside_it_as_if_it_were_certain() -> None:
+    """Rounding makes the variance across a flat covariance negative about as often as not."""
+    for heading in np.linspace(-3.0, 3.0, 101):
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        left = np.array([-ahead[1], ahead[0]])
+        flat = 0.49 * np.outer(ahead, ahead)
+        body = Obstacles(np.array([[[0.0, 0.0, heading]]]), np.array([[4.0, 2.0]]), flat[None, None], np.ones(1))
+        row = body.table(1e-3, 1.0, 5.0)[0, :, 0]
+        margin = margins(row, np.stack([1.9 * left, 2.1 * left]), 1.0)
+        assert margin[0] < 0 < margin[1]
+        pose = np.array([[1.9 * left[0]], [1.9 * left[1]], [1.0], [0.0]])
+        assert first_rectangle(pose, row[None, :, None], 0.0, np.zeros(1), 1.0) == 0
+        row[6] = math.nan
+        assert first_rectangle(pose * 1.2, row[None, :, None], 0.0, np.zeros(1), 1.0) == 0, "NaN is not clear"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_counts_as_far_touches_nothing_however_uncertain(seed: int) -> None:
+    rng, reach = np.random.default_rng(seed), 4.0
+    for _ in range(200):
+        root = rng.normal(0, 1.0, (2, 2)) * [1.0, rng.choice([0.01, 1.0])]
+        pose, size = np.array([[[0.0, 0.0, rng.uniform(-3, 3)]]]), rng.uniform(0.5, 5.0, (1, 2))
+        row = Obstacles(pose, size, (root @ root.T)[None, None], np.ones(1)).table(1e-3, 1.0, reach)[0, :, 0]
+        bearing = rng.uniform(-math.pi, math.pi, 200)
+        far = math.sqrt(row[10]) * np.stack([np.cos(bearing), np.sin(bearing)], -1)
+        assert (margins(row, far * (1 - (reach - 1.0) / math.sqrt(row[10])), 1.0) > -1e-9).all()
+
+
+def test_a_chance_above_one_half_still_keeps_the_distance() -> None:
+    body = Obstacles(np.zeros((1, 1, 3)), np.ones((1, 2)), np.eye(2)[None, None], np.ones(1))
+    assert body.table(0.6, 1.0, 1.0)[0, 9, 0] == 0.0
+
+
 def test_a_place_uncertain_ahead_does_not_count_as_uncertain_to_the_side() -> None:
     """Oncoming traffic in the next lane: where it is along its lane does not matter."""
     body = Obstacles(np.zeros((1, 1, 3)), np.array([[4.6, 1.9]]), np.array([[np.diag([9.0, 0.04])]]), np.ones(1))
@@ -119,6 +153,24 @@ def test_no_lines_and_lines_far_away_touch_nothing() -> None:
     line = np.array([(0.0, 0.0), (100.0, 0.0)])
     near = boundary([np.array([(0.0, 150.0), (100.0, 150.0)]), line], 1.0, within=(0.0, 0.0, 20.0))
     assert len(near.segment) == 1 and hit(near, 5.0, 0.5, 1.0) and not hit(near, 5.0, 150.0, 1.0)
+
+
+def test_circles_lie_along_the_heading() -> None:
+    lines = tuple(boundary([np.array([(-9.0, 3.0), (9.0, 3.0)])], 1.0)[:6])
+    pose = np.array([[0.0], [0.0], [0.6], [0.8]])  # 53 degrees to the left
+    assert first_line(pose, lines, np.array([0.0, 2.6]), 0.9) == 1
+    assert first_line(pose, lines, np.array([0.0, 2.7]), 0.9) == 0
+    assert first_line(pose * [[1], [1], [1], [-1]], lines, np.array([0.0, 2.7]), 0.9) == 1
+
+
+def test_long_segments_are_kept_where_they_pass_and_the_grid_ends_with_what_is_kept() -> None:
+    line = [np.array([(-40000.0, 0.0), (40000.0, 1.0)])]
+    near = boundary(line, 1.0, within=(0.0, 3.0, 20.0))
+    assert near.shape.prod() < 45 * 10 and hit(near, 5.0, 1.0, 0.6) and not hit(near, 5.0, 1.2, 0.6)
+    past = boundary([np.array([(-400.0, 300.0), (400.0, 300.0)])], 1.0, within=(0.0, 3.0, 20.0))
+    assert not hit(past, 0.0, 0.0, 1.0)
+    with pytest.raises(InputError, match=r"span 80000 by 80000 m.*within"):
+        boundary([np.array([(0.0, 0.0), (8e4, 8e4)])], 1.0)
 
 
 @pytest.mark.parametrize("line", [np.zeros((3, 3)), np.array([(0.0, math.nan), (1.0, 1.0)])])

@@ -24,7 +24,7 @@ from benchmarks import command
 from benchmarks.configured import made
 from benchmarks.figure import Figure, Measurement, Value, Values
 from benchmarks.kitti_baseline import DATA, PUBLIC, Effort
-from models.program import InputError
+from benchmarks.kitti_tracking import named
 
 
 class Settings(NamedTuple):
@@ -108,21 +108,12 @@ def described(chosen: Sequence[Settings]) -> str:
 
 def laser(effort: Effort) -> Values:
     """With the detector on laser points alone."""
-    return _scored(LASER, effort, camera=False)
+    return named(LASER, "kitti_folds_", lambda: follow(effort, camera=False))
 
 
 def both(effort: Effort) -> Values:
     """With the boxes in the camera's image as a second sensor."""
-    return _scored(BOTH, effort, camera=True)
-
-
-def _scored(measurement: Measurement, effort: Effort, *, camera: bool) -> Values:
-    keys = [figure.key for figure in measurement.figures]
-    try:
-        found = follow(effort, camera)
-    except InputError as absent:
-        return {key: Value(None, f"skipped: {absent}") for key in keys}
-    return {key: found[key.removeprefix("kitti_folds_").removesuffix("_camera")] for key in keys}
+    return named(BOTH, "kitti_folds_", lambda: follow(effort, camera=True))
 
 
 LASER = Measurement(

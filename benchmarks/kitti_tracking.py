@@ -11,6 +11,7 @@ benchmarks.kitti_folds leaves the reported sequence out of the choice of setting
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 
 from benchmarks import command
 from benchmarks.configured import made
@@ -53,21 +54,22 @@ def follow(effort: Effort, camera: bool) -> dict[str, Value]:
 
 def laser(effort: Effort) -> Values:
     """With the detector on laser points alone."""
-    return _chosen(LASER, effort, camera=False)
+    return named(LASER, "kitti_", lambda: follow(effort, camera=False))
 
 
 def both(effort: Effort) -> Values:
     """With the boxes in the camera's image as a second sensor."""
-    return _chosen(BOTH, effort, camera=True)
+    return named(BOTH, "kitti_", lambda: follow(effort, camera=True))
 
 
-def _chosen(measurement: Measurement, effort: Effort, *, camera: bool) -> Values:
+def named(measurement: Measurement, prefix: str, work: Callable[[], dict[str, Value]]) -> Values:
+    """Scores by the keys of a measurement, which begin with `prefix`; none of them where the data is absent."""
     keys = [figure.key for figure in measurement.figures]
     try:
-        found = follow(effort, camera)
+        found = work()
     except InputError as absent:
         return {key: Value(None, f"skipped: {absent}") for key in keys}
-    return {key: found[key.removeprefix("kitti_").removesuffix("_camera")] for key in keys}
+    return {key: found[key.removeprefix(prefix).removesuffix("_camera")] for key in keys}
 
 
 LASER = Measurement(

@@ -17,8 +17,10 @@ from typing import Any
 
 import hydra._internal.hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
@@ -152,6 +154,28 @@ def complain(error: BaseException, where: str = "waybayes") -> int:
         return 1
     print(f"{where}: {sentence}", file=sys.stderr, flush=True)
     return 2
+
+
+def one_job(
+    name: str, job_of: Callable[[dict[str, str]], Any], execute: Callable[[Any], object], show: Callable[[Path], None]
+) -> None:
+    """One job of the command `name`: says at once what went wrong; a sweep then goes on.
+
+    job_of(choices of the config's groups) -> what to execute, with a folder; show(folder) prints what is stored"""
+    known = HydraConfig.get()
+    try:
+        job = job_of(known.runtime.choices)
+        try:
+            execute(job)
+        except Incomplete:
+            show(job.folder)
+            raise
+        show(job.folder)
+    except Exception as error:
+        code = complain(error, " ".join([name, *known.overrides.task]))
+        if known.mode == RunMode.MULTIRUN:
+            raise JobFailed(code) from error
+        sys.exit(code)
 
 
 def guarded(work: Callable[[], object]) -> int:

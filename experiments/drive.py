@@ -19,12 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from experiments import store
-from experiments.command import Incomplete, JobFailed, complain, guarded, in_short, plain
+from experiments.command import Incomplete, guarded, in_short, one_job, plain
 from experiments.run import Job, check_settings
 from experiments.schema import build
 
@@ -190,21 +188,7 @@ def show(folder: Path) -> None:
 
 @hydra.main(config_path="pkg://configs", config_name="drive", version_base="1.3")
 def _launch(config: DictConfig) -> None:
-    """One job of the command line: says at once what went wrong; a sweep then goes on."""
-    known = HydraConfig.get()
-    try:
-        job = job_of(config, known.runtime.choices)
-        try:
-            execute(job)
-        except Incomplete:
-            show(job.folder)
-            raise
-        show(job.folder)
-    except Exception as error:
-        code = complain(error, " ".join(["drive", *known.overrides.task]))
-        if known.mode == RunMode.MULTIRUN:
-            raise JobFailed(code) from error
-        sys.exit(code)
+    one_job("drive", lambda choices: job_of(config, choices), execute, show)
 
 
 def main() -> None:

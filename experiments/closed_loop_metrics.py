@@ -1,7 +1,7 @@
 """What a drive is judged by: {metric: value}, of what was driven, not of what was planned.
 
     collisions             road users and boundary lines that were touched
-    collisions_at_fault    of these without those who drive into the vehicle from behind
+    collisions_at_fault    of these without those who drive into the vehicle from behind, or when it has stood a second
     clearance_m            least distance to a road user
     boundary_clearance_m   least distance to a boundary line
     limit_violations       control steps beyond a limit on acceleration along or across, curvature or speed
@@ -42,6 +42,7 @@ Floats = NDArray[np.float64]
 OVER = 1.02  # of a limit that is not yet a violation
 PASSED = 0.05  # beyond a line that is passed [m]
 STANDING = 0.05  # [m/s]
+STOOD = 1.0  # who has stood for as long is not at fault [s]
 AT_STOP = 2.0  # before a line stands at it [m]
 STEADY = 0.2  # of the acceleration of somebody who keeps a speed [m/s^2]
 CORNERS = 0.5 * np.array([[1, 1, -1, -1], [1, -1, -1, 1]], dtype=np.float64)
@@ -111,7 +112,9 @@ def contacts(drive: Drive) -> dict[int, bool]:
         there = np.flatnonzero(np.isfinite(pose[:, 0]))
         hit = there[shapely.intersects(own[there], shapely.polygons(outlines(pose[there], actor.size)))]
         if len(hit):
-            found[n] = not _from_behind(ego[hit[0]], pose[hit[0]])
+            stood = drive.log.looked >= drive.log.looked[hit[0]] - STOOD
+            stands = bool((ego[: hit[0] + 1][stood[: hit[0] + 1], 3] < STANDING).all()) and hit[0] > 0
+            found[n] = not (stands or _from_behind(ego[hit[0]], pose[hit[0]]))
     lines = [shapely.linestrings(line) for line in drive.scene.boundary]
     if lines and shapely.intersects(own, shapely.multilinestrings(lines)).any():
         found[-1] = True

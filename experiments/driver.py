@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from experiments.closed_loop import Mind, Thought
 from experiments.scenarios.driving import DriveScene
 from planning.behaviour import Manners, Memory, behave
@@ -25,6 +27,8 @@ def by_the_rules(
     roads = network(scene.lanes)
     times = [planner.step * (k + 1) for k in range(planner.num_steps)]
     decided, behaved = Decided(), Memory()
+    most = min(planner.comfort.speed, scene.wanted + manners.spare)
+    calm = replace(planner, comfort=replace(planner.comfort, speed=most))
 
     def think(now: float, state: FrenetState, tracks: Tracks) -> Thought:
         nonlocal decided, behaved
@@ -35,7 +39,7 @@ def by_the_rules(
             route, state, planner.vehicle, predictions, scene.stops, lights, decided, rules, places=places
         )
         given, behaved = behave(
-            planner,
+            calm,
             route,
             state,
             predictions,

@@ -21,16 +21,19 @@ from models.program import InputError
 from planning.candidates import Goal, Keep, Reach, follow, stop
 from planning.decision import PAST, Permissions
 from planning.frenet import FrenetState, to_pose
-from planning.gaps import Gap, Gaps, merging, movers_of
+from planning.gaps import ALIGNED, Gap, Gaps, merging, movers_of
 from planning.leads import Lead, lead_of
 from planning.planner import Planner, Scene
-from planning.release import LEFT, RIGHT, Passing, Release, passing
+from planning.release import LEFT, RIGHT, Passing, Release, extent, passing
+from planning.relief import eased, needed
 from planning.road import EDGE, Floats, Route, StopPoint
-from planning.shapes import Boundary, boundary
+from planning.shapes import Boundary, Obstacles, boundary
 from planning.situation import Along, Predictions, along
 from planning.speeds import speed_ahead, speed_before
 
 KEEP, FOLLOW, STOP, MERGE = "keep", "follow", "stop", "merge"
+STANDS = 0.01  # ahead of the front: who stands beside a lead may stay there [m]
+FASTER = 0.5  # a lead that is faster than this draws away: its speed is kept, no place behind it [m/s]
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,9 @@ def behave(
     vehicle, front = planner.vehicle, state.s + planner.vehicle.front
     line = barrier(route, stop_points, permissions, front)
     beside, centre = lane_beside(route, state)
-    around = passing(planner, route, state, predictions, told, stop_points, memory.passing, manners.release)
+    around = Passing()
+    if memory.passing.going or not beside:  # on its way into the route's lane it passes nobody there
+        around = passing(planner, route, state, predictions, told, stop_points, memory.passing, manners.release)
     movers = [] if around.going else movers_of(planner, route, state, predictions, told, manners.gaps)
     merge = merging(planner, route, state, movers, (memory.gap, memory.into), manners.braking, manners.gaps)
     line, gap = min(line, merge.line), merge.gap
@@ -125,11 +130,24 @@ def behave(
         offsets_about(wanted, low, high, manners),
         wanted,
         borders(planner, route, state, around, lines),
-        predictions.obstacles,
+        ahead_or_beside(planner, state, predictions, told),
         max(line, front),
-        line if lead is None else min(line, lead.stands(planner)),
+        line if lead is None else min(line, max(lead.stands(planner), front + STANDS)),
     )
     return scene, Memory(word, -1 if lead is None else lead.label, around, merge.labels, merge.into)
+
+
+def ahead_or_beside(planner: Planner, state: FrenetState, predictions: Predictions, places: Along) -> Obstacles:
+    """The obstacles without those who come along behind the vehicle on its own way: they keep their distance, and
+    predicted at their speed they would drive through it whenever it brakes."""
+    if not len(predictions.track):
+        return predictions.obstacles
+    across = extent(predictions, places).across[:, 0]
+    behind = places.on[:, 0] & (places.s[:, 0] < state.s) & (places.ahead[:, 0] > ALIGNED)
+    behind &= np.abs(places.d[:, 0] - state.d) < across + planner.vehicle.width / 2
+    tracks = np.unique(predictions.track[behind])
+    kept = ~np.isin(predictions.track, tracks)
+    return Obstacles(*(part[kept] for part in predictions.obstacles))
 
 
 def lane_beside(route: Route, state: FrenetState) -> tuple[bool, float]:
@@ -200,7 +218,7 @@ def choose(
         room = manners.room if lead.label == waits_for else manners.gap
         target = follow(lead.rear, lead.speed, lead.acceleration, vehicle.front, gap=room, headway=manners.headway)
         slack = manners.hysteresis if (memory.goal, memory.lead) == (FOLLOW, lead.label) else 1.0
-        slower = lead.speed <= speed + slack - 0.5
+        slower = lead.speed <= min(speed - 0.5, state.ds + FASTER) + slack
         if slower and target.place - state.s <= slack * braking_way(max(state.ds - lead.speed, 0.0), manners):
             found.append((target.place + vehicle.front, _reachable(target, state), FOLLOW))
     if found:
@@ -250,12 +268,16 @@ def left_lanes(planner: Planner, route: Route, state: FrenetState, around: Passi
 def borders(
     planner: Planner, route: Route, state: FrenetState, around: Passing, seen: Sequence[Floats] = ()
 ) -> Boundary:
-    """Lines near the vehicle: `seen`, and borders; where a lane is left, the far one of the lane beside it."""
+    """Near the vehicle, `seen` and borders; where a lane is left, the far one of the lane beside it; farther out where
+    the vehicle is across it already (planning.relief)."""
     sides, lines = left_lanes(planner, route, state, around), list(seen)
-    for n in range(len(route.lanes)):
-        for side in (LEFT, RIGHT):
+    reach = 20.0 + planner.horizon * (state.ds + planner.comfort.acceleration * planner.horizon / 2)
+    for side, column in ((LEFT, 0 if LEFT in sides else 1), (RIGHT, 3 if RIGHT in sides else 2)):
+        if (relief := needed(planner, route, state, side, column)) > 0.0:
+            lines.append(eased(route, state, side, column, relief, reach))
+            continue
+        for n in range(len(route.lanes)):
             far = route.outer[n][side]
             lines.append(route.borders[2 * n + side] if far is None or side not in sides else far)
     pose = to_pose(route.line, state)
-    reach = 20.0 + planner.horizon * (state.ds + planner.comfort.acceleration * planner.horizon / 2)
     return boundary(lines, planner.radius, within=(pose.x, pose.y, reach))

@@ -39,7 +39,12 @@ def hydra_context() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize(("group", "name"), [option for option in OPTIONS if option[0] != "planner"])
+DRIVEN = [("experiment", "commonroad")]  # experiments of the drive command
+
+
+@pytest.mark.parametrize(
+    ("group", "name"), [option for option in OPTIONS if option[0] != "planner" and option not in DRIVEN]
+)
 def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: str) -> None:
     config = plain(compose("run", [f"{group}={name}"]))
     check_targets(config)
@@ -53,10 +58,19 @@ def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: s
 def test_every_config_of_a_drive_composes_and_builds_what_the_code_has_as_defaults(group: str, name: str) -> None:
     config = plain(compose("drive", [f"{group}={name}"]))
     check_targets(config)
-    parts = build({key: config[key] for key in ("scenario", "driver", "planner", "loop", "metrics", "figures")})
-    assert isinstance(parts["scenario"], DriveScene)
+    parts = build({key: config[key] for key in ("driver", "planner", "loop", "metrics", "figures")})
+    if config["scenario"].get("file") != MISSING:  # a reader has no default
+        assert isinstance(build(config["scenario"], "scenario"), DriveScene)
     assert (parts["planner"], parts["loop"]) == (Planner(), Loop())
     assert parts["driver"].keywords == {"situation": Situation(), "rules": Rules(), "manners": Manners()}
+
+
+@pytest.mark.parametrize(("group", "name"), DRIVEN)
+def test_every_experiment_of_a_drive_composes_and_builds(group: str, name: str) -> None:
+    config = plain(compose("drive", [f"{group}={name}", "scenario.file=some.xml"]))
+    check_targets(config)
+    parts = build({key: config[key] for key in ("driver", "planner", "loop", "metrics", "figures")})
+    assert isinstance(parts["planner"], Planner) and config["scenario"]["vehicle"] == config["planner"]["vehicle"]
 
 
 def check_targets(config: Any) -> None:

@@ -198,6 +198,7 @@ class DriveScene(NamedTuple):
     duration  [s]
     noise     of the tracks that are made of the actors
     info      plain numbers and strings for the manifest
+    wanted    speed to drive at where limits, curves and others allow it [m/s]
     """
 
     name: str
@@ -211,6 +212,7 @@ class DriveScene(NamedTuple):
     duration: float
     noise: Noise = Noise()
     info: Mapping[str, Any] = MappingProxyType({})
+    wanted: float = math.inf
 
     def lights_at(self, time: float) -> dict[str, str]:
         """{name of a stop point: state of its light}"""

@@ -2,9 +2,11 @@
 
     tracks of the road users, with noise -> situation, decisions, behaviour -> planner -> control -> vehicle
 
-A plan begins where the last one says the vehicle is now, so that plans agree with one another, unless the vehicle is
-farther from there than a tolerance: then where it is. Nothing raises once the vehicle moves: a cycle that cannot be
-planned is an emergency stop along the last plan, and told.
+What is followed is the plan, or what optimal control makes of it (planning.optimal) where that is asked for.
+
+A plan begins where what is followed says the vehicle is now, so that plans agree with one another, unless the vehicle
+is farther from there than a tolerance: then where it is. Nothing raises once the vehicle moves: a cycle that cannot be
+planned is an emergency stop along what was followed last, and told.
 """
 
 from __future__ import annotations
@@ -23,9 +25,11 @@ from experiments.scenarios.driving import Body, DriveScene, observe
 from models.program import InputError
 from planning.control import Command, Control, Lags, command, moved
 from planning.frenet import FrenetState, Pose, to_frenet, to_pose
+from planning.optimal import refine
 from planning.planner import EMERGENCY, Plan, Planner, plan
 from planning.planner import Scene as PlanScene
 from planning.polynomials import quartics, quintics
+from planning.refined import Refined
 from planning.road import Route, Tracks, route
 from planning.shapes import Vehicle
 
@@ -38,12 +42,14 @@ class Loop:
     """Settings; a cycle takes as long as the planner's end times are apart (planning.candidates.Fans.cycle).
 
     world      between movements of other road users, and between looks for contact [s]
-    tolerance  from the last plan, within which the next one begins on it [m]
+    tolerance  from what is followed, within which the next plan begins on it [m]
+    refine     whether refined plans are followed; of an emergency stop, only the rest of the last refined motion is
     control    and the time constants the vehicle really has
     """
 
     world: float = 0.05
     tolerance: float = 0.3
+    refine: bool = False
     control: Control = field(default_factory=Control)
     lags: Lags = field(default_factory=Lags)
 
@@ -76,11 +82,14 @@ class Log(NamedTuple):
     wanted, command  (N + 1, 6) the same by plan; (N + 1, 2) acceleration, curvature
     looked, others   (K,) [s], (K, A, 5) x, y, heading, speed, acceleration of middles, NaN where they are not there
     cycle            (C,) [s]
-    ms               (C,) of a cycle up to its plan
-    tier, clear      (C,) of its plan
-    cost             (C,)
-    planned          (C, H, 6) from its time on
-    consistency      (C,) largest distance from the plan before, NaN where there is none [m]
+    ms               (C,) of a cycle up to what is followed, without building problems of optimal control
+    building         (C,) these, once each [s]
+    tier, clear      (C,) of what is followed
+    cost, plan_cost  (C,) of what is followed, and of the plan
+    refined          (C,) whether a refined motion is followed
+    unrefined        (C,) why none is, where one was asked for, else nothing
+    planned          (C, H, 6) what is followed, from its time on
+    consistency      (C,) largest distance from what was followed before, NaN where there is nothing [m]
     stop             (C,) arc length that the front must not pass [m]
     goal             (C,) place, speed of what was aimed at behind or before; place NaN where only a speed was
     words, stated    (C,) what was thought; why a cycle could not be planned, else nothing
@@ -94,9 +103,13 @@ class Log(NamedTuple):
     others: Floats
     cycle: Floats
     ms: Floats
+    building: Floats
     tier: NDArray[np.str_]
     clear: NDArray[np.bool_]
     cost: Floats
+    plan_cost: Floats
+    refined: NDArray[np.bool_]
+    unrefined: NDArray[np.str_]
     planned: Floats
     consistency: Floats
     stop: Floats
@@ -106,7 +119,7 @@ class Log(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """A drive: its log, and what each cycle planned in and planned."""
+    """A drive: its log, and what each cycle planned in and planned, before refinement."""
 
     scene: DriveScene
     route: Route
@@ -138,7 +151,10 @@ def drive(
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     others: list[Pose | None] = [None] * len(scene.actors)
     others = _others(scene, planner.vehicle, 0.0, 0.0, others, scene.ego)
-    ego, made, given = scene.ego, None, None
+    ego, given = scene.ego, None
+    made: Plan | None = None
+    better: Refined | None = None
+    followed: Plan | Refined | None = None
     driven: list[tuple[Pose, Pose, Command]] = []
     looks, cycles, givens, plans = [others], [], [], []
     per_look = round(loop.world / loop.control.step)
@@ -148,24 +164,25 @@ def drive(
         now, began, stated, words = number * cycle, time.perf_counter(), "", ""
         tracks = observe(scene, others, rng)
         try:
-            state = _start(way, ego, made, cycle, loop.tolerance)
+            state = _start(way, ego, followed, cycle, loop.tolerance)
             given, words = think(now, state, tracks)
-            following = plan(planner, given, made, cycle)
+            found = plan(planner, given, made, cycle)
+            if loop.refine:
+                better = refine(planner, given, found, better, cycle, solve=found.tier != EMERGENCY)
         except InputError as error:
-            if made is None or given is None:
+            if followed is None or given is None:
                 raise
             stated = str(error)
-            following = stop_along(planner, made, cycle)
-        ms = 1e3 * (time.perf_counter() - began)
-        planned.append(following.trajectory(horizon))
-        apart = math.nan if made is None else _apart(planned[-1][:-gone], planned[-2][gone:])
-        cycles.append(
-            (now, ms, following.tier, following.clear, following.cost, apart, given.stop, _aim(given), words, stated)
-        )
+            found, better = stop_along(planner, followed, cycle), None
+        made, followed = found, found if better is None or not better.accepted else better
+        building, why = (0.0, "") if better is None else (better.building, "" if better.accepted else better.why)
+        ms = 1e3 * (time.perf_counter() - began - building)
+        planned.append(followed.trajectory(horizon))
+        apart = math.nan if number == 0 else _apart(planned[-1][:-gone], planned[-2][gone:])
+        cycles.append((now, ms, building, found, followed, why, apart, given.stop, _aim(given), words, stated))
         givens.append(given)
-        plans.append(following)
-        made = following
-        poses = [Pose(*row) for row in made.trajectory(np.arange(0.0, cycle + 1e-9, loop.control.step))]
+        plans.append(found)
+        poses = [Pose(*row) for row in followed.trajectory(np.arange(0.0, cycle + 1e-9, loop.control.step))]
         for k, (wanted, after) in enumerate(pairwise(poses), start=1):
             told = command(loop.control, planner.able, ego, wanted, after)
             driven.append((ego, wanted, told))
@@ -177,22 +194,25 @@ def drive(
     return Drive(scene, way, planner, _log(scene, loop, driven, looks, cycles, planned), givens, plans)
 
 
-def stop_along(planner: Planner, last: Plan, elapsed: float) -> Plan:
-    """From where a plan is after a time, to rest as hard as the vehicle can along the plan's own path.
+def stop_along(planner: Planner, last: Plan | Refined, elapsed: float) -> Plan:
+    """From where a motion is after a time, to rest as hard as the vehicle can along the motion's own path.
 
     A quartic from v to rest in T brakes by 3 v / 2 T at most (from a = 0)."""
     state = last.states([elapsed])[0]
     duration = np.array([max(1.5 * state.ds / planner.able.braking, planner.fans.cycle)])
-    lateral = last.lateral
-    if not lateral.by_way[0]:
-        left = max(float(lateral.motion.duration[0]) - elapsed, 0.0)
-        way = max(float(last.along(np.array([elapsed + left]))[0, 0]) - state.s, SHORTEST)
-        across = quintics((state.d, state.slope, state.bend), [[lateral.target[0], 0.0, 0.0]], [way])
-        lateral = lateral._replace(motion=across, by_way=np.array([True]))
+    begun = last.plan if isinstance(last, Refined) else last
+    lateral, refined = begun.lateral, last.across if isinstance(last, Refined) and last.accepted else None
+    if refined is None and lateral.by_way[0]:
+        lateral = lateral._replace(motion=lateral.motion.later(state.s - begun.start.s))
     else:
-        lateral = lateral._replace(motion=lateral.motion.later(state.s - last.start.s))
+        target, end = float(lateral.target[0]), float(lateral.motion.duration[0])
+        if refined is not None:
+            target, _, end = refined.end()
+        way = max(last.states([max(end, elapsed)])[0].s - state.s, SHORTEST)
+        across = quintics((state.d, state.slope, state.bend), [[target, 0.0, 0.0]], [way])
+        lateral = lateral._replace(motion=across, by_way=np.array([True]), target=np.array([target]))
     motion = quartics((state.s, state.ds, state.dds), [0.0], duration)
-    return last._replace(
+    return begun._replace(
         start=state, longitudinal=motion, lateral=lateral, tier=EMERGENCY, clear=False, cost=math.inf, rejected={}
     )
 
@@ -203,8 +223,8 @@ def middle_of(vehicle: Vehicle, pose: Pose) -> Pose:
     return pose._replace(x=x, y=y)
 
 
-def _start(way: Route, ego: Pose, last: Plan | None, elapsed: float, tolerance: float) -> FrenetState:
-    """Where to plan from: on the last plan, or where the vehicle is."""
+def _start(way: Route, ego: Pose, last: Plan | Refined | None, elapsed: float, tolerance: float) -> FrenetState:
+    """Where to plan from: on what was followed, or where the vehicle is."""
     if last is None:
         return to_frenet(way.line, ego)
     state = last.states([elapsed])[0]
@@ -248,7 +268,7 @@ def _log(
         for n, pose in enumerate(look):
             if pose is not None:
                 others[k, n] = pose[:5]
-    now, ms, tier, clear, cost, apart, stop, aim, words, stated = zip(*cycles, strict=True)
+    now, ms, building, plans, followed, why, apart, stop, aim, words, stated = zip(*cycles, strict=True)
     ego, wanted, told = (np.array(column, float) for column in zip(*driven, strict=True))
     return Log(
         time=loop.control.step * np.arange(len(driven), dtype=np.float64),
@@ -259,9 +279,13 @@ def _log(
         others=others,
         cycle=np.array(now),
         ms=np.array(ms),
-        tier=np.array(tier),
-        clear=np.array(clear),
-        cost=np.array(cost),
+        building=np.array(building),
+        tier=np.array([motion.tier for motion in followed]),
+        clear=np.array([motion.clear for motion in followed]),
+        cost=np.array([motion.cost for motion in followed]),
+        plan_cost=np.array([found.cost for found in plans]),
+        refined=np.array([isinstance(motion, Refined) for motion in followed]),
+        unrefined=np.array(why),
         planned=np.stack(planned),
         consistency=np.array(apart),
         stop=np.array(stop),

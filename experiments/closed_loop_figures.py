@@ -62,9 +62,9 @@ def cycle_figure(drive: Drive, number: int) -> Figure:
     colours = colours_of(fan)
     draw_cycle(axes, drive, number, fan, colours)
     axes.set(xlabel="x [m]", ylabel="y [m]")
-    made = drive.plans[number]
+    tier, count = drive.log.tier[number], sum(fan.numbers.values())
     axes.set_title(
-        f"{drive.scene.name}, {drive.log.cycle[number]:.2f} s: {made.tier}, {sum(fan.numbers.values())} candidates",
+        f"{drive.scene.name}, {drive.log.cycle[number]:.2f} s: {tier}, {count} candidates",
         loc="left",
         fontsize=11,
     )

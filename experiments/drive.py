@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from html import escape
 from pathlib import Path
@@ -65,7 +66,9 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
     began = time.perf_counter()
     found = drive(scene, parts["driver"], parts["planner"], parts["loop"], seed=job.config["seed"])
     seconds["drive"] = time.perf_counter() - began
-    say(f"driven     {len(found.plans)} cycles in {seconds['drive']:.1f} s")
+    seconds["building"] = float(found.log.building.sum())
+    of_it = f", of it {seconds['building']:.1f} s to build problems of optimal control" if seconds["building"] else ""
+    say(f"driven     {len(found.plans)} cycles in {seconds['drive']:.1f} s{of_it}")
     failures: dict[str, Exception] = {}
 
     def collect(kind: str) -> dict[str, Any]:
@@ -115,9 +118,20 @@ def write(
 def cycles(found: Drive) -> list[dict[str, Any]]:
     """What each cycle did, in rows."""
     log = found.log
-    told = zip(log.cycle, log.ms, log.tier, log.clear, log.cost, log.consistency, log.words, log.stated, strict=True)
-    names = ("time_s", "cycle_ms", "tier", "clear", "cost", "consistency_m", "thought", "stated")
-    rows = [dict(zip(names, map(_plain, row), strict=True)) for row in told]
+    told = {
+        "time_s": log.cycle,
+        "cycle_ms": log.ms,
+        "tier": log.tier,
+        "clear": log.clear,
+        "cost": log.cost,
+        "plan_cost": log.plan_cost,
+        "refined": log.refined,
+        "unrefined": log.unrefined,
+        "consistency_m": log.consistency,
+        "thought": log.words,
+        "stated": log.stated,
+    }
+    rows = [dict(zip(told, map(_plain, row), strict=True)) for row in zip(*told.values(), strict=True)]
     for row, made in zip(rows, found.plans, strict=True):
         row["rejected"] = ", ".join(f"{reason} {count}" for reason, count in made.rejected.items())
     return rows
@@ -148,6 +162,7 @@ def report(
     for made in found.plans:
         for reason, count in made.rejected.items():
             turned_down[reason] = turned_down.get(reason, 0) + count
+    unrefined = Counter(str(why) for why in found.log.unrefined if why).most_common()
     body = [
         f"<h1>{escape(job.name)}</h1>",
         f'<p class="sub">scene {escape(found.scene.name)} &middot; {escape(manifest["date"])}</p>',
@@ -159,6 +174,7 @@ def report(
         table(("time [s]", "why"), stated),
         "<h2>Candidates turned down</h2>",
         table(("reason", "candidates"), sorted(turned_down.items(), key=lambda item: -item[1])),
+        *(["<h2>Cycles that were not refined</h2>", table(("why", "cycles"), unrefined)] if unrefined else []),
         "<h2>What was thought</h2>",
         table(("from [s]", "thought"), thought),
         "<h2>Time</h2>",

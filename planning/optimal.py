@@ -11,18 +11,18 @@ the limits of comfort and costs no more than the candidate; else the candidate s
 
 from __future__ import annotations
 
-import math
+import time
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planning import optimal_problem as problem
-from planning.candidates import Keep, Reach, Weights
+from planning.candidates import Keep, Reach
 from planning.corridor import corridor
-from planning.frenet import FrenetState, to_pose, to_poses
+from planning.frenet import to_pose
 from planning.kinematics import LIMITS, PLACED
-from planning.optimal_problem import ACROSS, CURVATURE, PLACE, TO_PLACE, TO_SPEED, Shape
+from planning.optimal_problem import CURVATURE, PLACE, TO_PLACE, TO_SPEED, Shape
 from planning.planner import (
     COMFORT,
     EMERGENCY,
@@ -33,14 +33,13 @@ from planning.planner import (
     Scene,
     candidates_of,
     chosen,
-    forwards,
     judge,
     judge_states,
     rectangles,
-    state_of,
 )
-from planning.polynomials import NOTHING, Polynomials, quartics, quintics, squared_jerk
+from planning.polynomials import NOTHING
 from planning.reference import ReferenceLine
+from planning.refined import Motion, Refined, motions, moved
 from planning.shapes import OUTLINE, outlines
 
 Floats = NDArray[np.float64]
@@ -54,97 +53,8 @@ NODES = 14  # of the line in a stage's stretch
 SHORT = 1e-3  # of the last place allowed [m]
 STAY = 0.02  # by which the rest of the last motion may cost more than the best one found now
 DEARER = "costs more"
+UNSOLVED = "not looked for"
 FAR = 1e3  # [m], of what is not there
-
-
-class Motion(NamedTuple):
-    """Constant jerk over stages of `stage` seconds, then a polynomial; of which `gone` seconds are over.
-
-    states (N + 1, 3), jerk (N,); price (N + 1,) of the squared jerk in each stage and in the tail; arrival  of the
-    candidate that it was made from [s]"""
-
-    stage: float
-    states: Floats
-    jerk: Floats
-    tail: Polynomials
-    price: Floats
-    arrival: float
-    gone: float = 0.0
-
-    @property
-    def horizon(self) -> float:
-        """Where the tail begins [s]."""
-        return len(self.jerk) * self.stage
-
-    def end(self) -> tuple[float, float, float]:
-        """q, q' at the tail's end, and when that is."""
-        q, first = self.tail.end()[0]
-        return float(q), float(first), self.horizon + float(self.tail.duration[0]) - self.gone
-
-    def price_left(self, weights: Weights) -> float:
-        """k_j int(price jerk^2) + k_t T of what is left."""
-        ends = self.stage * np.arange(1.0, len(self.jerk) + 1.0)
-        left = np.clip(ends - self.gone, 0.0, self.stage)
-        tail = squared_jerk(self.tail.later(max(self.gone - self.horizon, 0.0)))[0]
-        jerk = (self.price[:-1] * left * self.jerk**2).sum() + self.price[-1] * tail
-        return float(weights.jerk * jerk + weights.time * max(self.arrival - self.gone, 0.0))
-
-    def at(self, t: Floats) -> Floats:
-        """q, q', q'' (K, 3) at times t (K,)."""
-        t, n = t + self.gone, len(self.jerk)
-        k = np.minimum((t / self.stage + 1e-9).astype(np.int64), n - 1)
-        told = np.stack(problem.advance(self.states[k].T, [self.jerk[k]], t - k * self.stage), -1)  # type: ignore[arg-type]
-        beyond = t > self.horizon
-        told[beyond] = self.tail.at(t[beyond] - self.horizon)[0]
-        return told
-
-
-class Refined(NamedTuple):
-    """What came of a refinement.
-
-    plan      that it began from
-    accepted  whether the refined motion is followed; if not, `why`: not converged, costs more, or what it breaks
-    along, across  the refined motion, where the solver made one
-    cost, candidate_cost  of both by the same functional; NaN without a motion
-    solver    that made it, or that failed last; `iterations` of all solvers
-    line_error  of the line as told to the solver [m]
-    rest      whether the motion followed is what is left of the last one
-    """
-
-    plan: Plan
-    accepted: bool
-    why: str
-    along: Motion | None = None
-    across: Motion | None = None
-    cost: float = math.nan
-    candidate_cost: float = math.nan
-    solver: str = "none"
-    converged: bool = False
-    iterations: int = 0
-    line_error: float = math.nan
-    rest: bool = False
-
-    @property
-    def tier(self) -> str:
-        """Of what is followed."""
-        return COMFORT if self.accepted else self.plan.tier
-
-    @property
-    def clear(self) -> bool:
-        """Whether what is followed breaks nothing within the horizon."""
-        return self.accepted or self.plan.clear
-
-    def states(self, t: list[float] | Floats) -> list[FrenetState]:
-        """Where the vehicle is along the line at times t after the start."""
-        if not self.accepted or self.along is None or self.across is None:
-            return self.plan.states(t)
-        given = np.asarray(t, float)
-        along, across = forwards(self.along.at(given)), self.across.at(given)
-        return [state_of(a, d) for a, d in zip(along, across, strict=True)]
-
-    def trajectory(self, t: list[float] | Floats) -> Floats:
-        """x, y, heading, speed, acceleration, curvature (K, 6) at times t after the start."""
-        return to_poses(self.plan.line, self.states(t))
 
 
 def refine(
@@ -155,23 +65,25 @@ def refine(
     elapsed: float = 0.0,
     *,
     per_stage: int = PER_STAGE,
+    solve: bool = True,
 ) -> Refined:
     """The plan of this scene, or a better motion: it costs no more, or it is comfortable where no candidate was.
 
     previous, elapsed  the last refinement, if the vehicle follows it, and the time since its start [s]
     per_stage          of the planner's steps, in which jerk is constant
+    solve              whether a motion is looked for; else only the rest of the last one, if it is good
 
     A horizon that recedes finds another best motion in every cycle. So what is left of the last one is followed as long
     as it is good, costs no more than the candidate, and no more than STAY beyond the best motion found now.
     Nothing is raised for what a solver does: the candidate stays."""
     try:
-        told = _refined(planner, scene, found, per_stage)
+        told = _refined(planner, scene, found, per_stage) if solve else Refined(found, False, UNSOLVED)
     except (RuntimeError, ArithmeticError, np.linalg.LinAlgError) as failure:  # CasADi raises RuntimeError
         told = Refined(found, False, f"the solver failed: {failure}")
     rest = _rest(planner, scene, found, previous, elapsed)
     if rest is None or (told.accepted and rest.cost > (1.0 + STAY) * told.cost):
         return told
-    return rest._replace(iterations=told.iterations)
+    return rest._replace(iterations=told.iterations, building=told.building)
 
 
 def _rest(planner: Planner, scene: Scene, found: Plan, previous: Refined | None, elapsed: float) -> Refined | None:
@@ -208,18 +120,19 @@ def _refined(planner: Planner, scene: Scene, found: Plan, per_stage: int) -> Ref
     shape, given, error = _posed(planner, scene, begun, per_stage)
     stages = shape.stage * np.arange(shape.num_stages + 1.0)
     guess = _packed(_from_start(begun, stages), shape.stage)
-    told, iterations = Refined(found, False, "not converged", line_error=error), 0
+    told, iterations, building = Refined(found, False, "not converged", line_error=error), 0, 0.0
     for fine in (False, True):
         shape = shape._replace(fine=fine)
         solved = _solved(shape, given, guess)
         iterations += solved.iterations
+        building += solved.building
         if not solved.converged:
             told = told._replace(solver=solved.solver)
             break
         told = _judged(planner, scene, found, begun, shape, given, solved, error)
         if told.accepted or told.why == DEARER:
             break
-    return told._replace(iterations=iterations)
+    return told._replace(iterations=iterations, building=building)
 
 
 class _Solved(NamedTuple):
@@ -228,22 +141,27 @@ class _Solved(NamedTuple):
     converged: bool
     solver: str
     iterations: int
+    building: float
 
 
 def _solved(shape: Shape, given: dict[str, Floats], guess: Floats) -> _Solved:
     """By fatrop, else by IPOPT."""
+    began = time.perf_counter()
     built = problem.problem(shape)
+    building = time.perf_counter() - began
     parameters = np.concatenate([given[name].reshape(size).ravel("F") for name, size in built.parameters.items()])
     iterations = 0
     for name in problem.SOLVERS:
+        began = time.perf_counter()
         solve = problem.solver(shape, name)
+        building += time.perf_counter() - began
         result = solve(x0=guess, p=parameters, lbg=built.lower, ubg=built.upper)
         stats = solve.stats()
         iterations += int(stats["iter_count"])
         if stats["success"]:
             break
     controls = np.asarray(result["x"]).ravel()[:-6].reshape(-1, 8)[:, 6:]
-    return _Solved(controls, float(result["f"]), bool(stats["success"]), name, iterations)
+    return _Solved(controls, float(result["f"]), bool(stats["success"]), name, iterations, building)
 
 
 def _judged(
@@ -258,10 +176,10 @@ def _judged(
 ) -> Refined:
     """Whether a solution is followed."""
     arrivals = float(begun.longitudinal.duration[0]), float(begun.lateral.motion.duration[0])
-    along, across = _motions(shape, given, solved.controls, arrivals)
+    along, across = motions(shape, given, solved.controls, arrivals)
     weights = planner.weights
     cost = solved.cost + weights.time * (weights.longitudinal * arrivals[0] + weights.lateral * arrivals[1])
-    along = _moved(along, scene.state.s)
+    along = moved(along, scene.state.s)
     why = _broken(planner, scene, along, across)
     if why == "none" and found.tier == COMFORT and not cost <= found.cost:
         why = DEARER
@@ -384,32 +302,3 @@ def _near(planner: Planner, scene: Scene, begun: Plan, radius: float, num_steps:
     kept[: len(rows), : len(nearest)] = rows[:, nearest]
     kept[len(rows) :] = kept[len(rows) - 1]
     return kept
-
-
-def _motions(
-    shape: Shape, given: dict[str, Floats], controls: Floats, arrivals: tuple[float, float]
-) -> tuple[Motion, Motion]:
-    """Along and across, from the start by the controls, and on to the ends that cost least."""
-    states, ends = [given["start"]], given["ends"]
-    for u in controls:
-        states.append(np.array(problem.advance(list(states[-1]), list(u), shape.stage)))
-    told, made = np.array(states), list[Motion]()
-    for i, kind in enumerate((shape.kind, ACROSS)):
-        part = told[:, 3 * i : 3 * i + 3]
-        _, pace, left, price = own = ends[4 * i : 4 * i + 4]
-        end = float(problem.closing(kind, shape.weights)(part[-1], own)[1])
-        first = tuple(map(float, part[-1]))
-        if kind == TO_SPEED:
-            tail = quartics(first, [end], [left])
-        else:
-            tail = quintics(first, [[end, pace if kind == TO_PLACE else 0.0, 0.0]], [left])
-        made.append(Motion(shape.stage, part, controls[:, i], tail, np.r_[given["price"][i], price], arrivals[i]))
-    return made[0], made[1]
-
-
-def _moved(motion: Motion, by: float) -> Motion:
-    """The same from another origin."""
-    states, coefficients = motion.states.copy(), motion.tail.coefficients.copy()
-    states[:, 0] += by
-    coefficients[:, 0] += by
-    return motion._replace(states=states, tail=motion.tail._replace(coefficients=coefficients))

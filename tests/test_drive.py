@@ -160,6 +160,39 @@ def test_an_emergency_stop_keeps_the_path_of_a_lateral_motion() -> None:
     assert braking.min() > -1.02 * planner.able.braking
 
 
+REFINED = Loop(refine=True)
+
+
+@pytest.mark.parametrize(("name", "speed"), [("follow", 10.0), ("parked_car", 6.0)])
+def test_refined_motions_are_followed_within_all_limits(name: str, speed: float) -> None:
+    scene = getattr(driven_roads, name)(duration=4.5)
+    found = drive(scene._replace(ego=scene.ego._replace(speed=speed)), by_the_rules, loop=REFINED)
+    log, told = found.log, metrics(found)
+    assert (told["collisions"], told["limit_violations"], told["stops_passed"], told["stated"]) == (0, 0, 0, 0)
+    assert told["refined"] > 0.5 and told["cost_mean"] < told["plan_cost_mean"]
+    assert (log.cost[log.refined] <= log.plan_cost[log.refined]).all()
+    np.testing.assert_array_equal(log.cost[~log.refined], log.plan_cost[~log.refined])
+    assert ((log.unrefined != "") == ~log.refined).all()
+    gone = round(found.planner.fans.cycle / found.planner.step)
+    np.testing.assert_allclose(log.planned[1:, 0], log.planned[:-1, gone], atol=1e-6)  # each begins on what is followed
+    assert told["tracking_m"] < 0.02
+
+
+def test_a_refined_drive_that_loses_sight_stops_from_what_it_followed() -> None:
+    scene = driven_roads.follow(duration=4.5)._replace(actors=())
+    scene = scene._replace(ego=scene.ego._replace(y=scene.ego.y + 0.8))
+    found = drive(scene, steady(6.0, fails=(0.9, math.inf)), loop=REFINED)
+    log, gone = found.log, round(found.planner.fans.cycle / found.planner.step)
+    first = int(np.argmax(log.stated != ""))
+    assert log.refined[:first].all() and not log.refined[first:].any() and set(log.tier[first:]) == {EMERGENCY}
+    np.testing.assert_allclose(log.planned[1:, 0], log.planned[:-1, gone], atol=1e-6)
+    unrefined = found.plans[first - 1].trajectory([found.planner.fans.cycle])[0]
+    assert np.abs(log.planned[first, 0] - unrefined).max() > 1e-3, "and not from the plan"
+    there = found.route.line.project(log.ego[:, :2])[0][:, 1]
+    assert np.diff(there).max() < 1e-3 and there.min() > -0.05, "towards the offset that it was on its way to"
+    assert not violations(found).any() and log.ego[-1, 3] < 1e-3
+
+
 def test_a_scene_that_cannot_be_begun_is_refused() -> None:
     scene = driven_roads.follow()
     with pytest.raises(InputError, match="before or after the line"):

@@ -279,6 +279,16 @@ def test_a_vehicle_that_left_its_motion_does_not_get_the_rest_of_it() -> None:
     assert not refine(PLANNER, moved, plan(PLANNER, moved), first, 0.15).rest
 
 
+def test_where_nothing_is_to_be_solved_only_the_rest_is_followed() -> None:
+    given = scene(START, Keep(12.0))
+    first = refine(PLANNER, given, plan(PLANNER, given))
+    alone = refine(PLANNER, given, first.plan, solve=False)
+    assert not alone.accepted and alone.iterations == 0 and alone.why == optimal.UNSOLVED
+    rest = refine(PLANNER, given, first.plan, first, 0.0, solve=False)
+    assert rest.rest and rest.accepted and rest.iterations == 0
+    np.testing.assert_array_equal(rest.trajectory(T), first.trajectory(T))
+
+
 def test_what_the_solver_is_not_told_is_found_by_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
     given = scene(START, Keep(10.0), obstacles=rectangle(50.0, 1.6))
     found = plan(PLANNER, given)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -148,6 +149,20 @@ class Route(NamedTuple):
     def limit_at(self, s: ArrayLike) -> Floats:
         """Speed limit (*,) at arc lengths (*,) [m/s]."""
         return self.speed[np.clip(np.searchsorted(self.start, s, "right") - 1, 0, len(self.speed) - 1)]
+
+
+def read_route(path: str | Path) -> tuple[int, ...]:
+    """The vector of lane ids in a text file, in driving order, separated by blanks, commas or line ends ([K15], IV-A: a
+    router may take its place). Raises InputError for a file that is not there, is empty or holds other words."""
+    try:
+        words = Path(path).read_text().replace(",", " ").split()
+    except (OSError, UnicodeDecodeError) as absent:
+        raise InputError(f"route file {path} cannot be read: {absent}") from absent
+    if wrong := [word for word in words if not word.lstrip("-").isdigit()]:
+        raise InputError(f"route file {path} has '{wrong[0]}' where a lane id should be; write integers only")
+    if not words:
+        raise InputError(f"route file {path} is empty; write lane ids in driving order")
+    return tuple(map(int, words))
 
 
 def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:

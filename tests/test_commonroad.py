@@ -294,6 +294,26 @@ def test_scenarios_that_cannot_be_driven_are_one_sentence(write: Any) -> None:
         commonroad(write(OLD[: OLD.index("<planningProblem")] + "</commonRoad>"))
 
 
+def test_a_route_file_is_driven_along(write: Any, tmp_path: Path) -> None:
+    way = tmp_path / "route.txt"
+    way.write_text("1,\n2")
+    assert commonroad(write(OLD), route=str(way)).route[:2] == (1, 2)
+    way.write_text("1 3")  # into the lane beside
+    assert 3 in commonroad(write(OLD), route=str(way), duration=5.0).route
+    for text, sentence in (
+        ("1 two", "has 'two' where a lane id should be"),
+        ("", "is empty"),
+        ("1 9", "names lane 9, which is none that a car may drive on"),
+        ("3 2", "lane 2 neither follows lane 3 nor lies beside it"),
+        ("2", "begins on lane 2, but the vehicle starts on lane 1"),
+    ):
+        way.write_text(text)
+        with pytest.raises(InputError, match=sentence):
+            commonroad(write(OLD), route=str(way))
+    with pytest.raises(InputError, match="cannot be read"):
+        commonroad(write(OLD), route=str(tmp_path / "none.txt"))
+
+
 def test_headings_are_within_a_span_whatever_full_turns_lie_between() -> None:
     heading = np.array([0.0, 3.2, -3.2 + 0.1, 3.4])
     np.testing.assert_array_equal(within_turn(heading, (3.1, 3.3)), [False, True, True, False])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from numpy.typing import NDArray
 from experiments.scenarios.commonroad import Goal, Obstacle, Problem, Recording, read
 from experiments.scenarios.commonroad_stops import stops_of
 from experiments.scenarios.driving import Actor, DriveScene, Noise, Recorded
-from experiments.scenarios.lane_search import backwards, lanes_at, onwards, route_of, search
+from experiments.scenarios.lane_search import backwards, lanes_at, neighbours, onwards, route_of, search
 from models.program import InputError
 from planning.frenet import Pose
-from planning.road import Lane, Lanes
+from planning.road import Lane, Lanes, read_route
 from planning.road import route as way_along
 from planning.shapes import Vehicle
 
@@ -38,6 +39,7 @@ def commonroad(
     problem: int | None = None,
     start: int | None = None,
     goal: int | None = None,
+    route: str | None = None,
     speed: float | None = None,
     duration: float | None = None,
     beyond: float = 100.0,
@@ -49,6 +51,8 @@ def commonroad(
 
     problem   id of the planning problem; the first one where none is told
     start     id of a lane on whose middle to begin instead, at rest; goal: id of a lane to reach instead
+    route     text file of lane ids to drive along, each a successor or neighbour of the one before (planning.road's
+              read_route), instead of the shortest way
     speed     wanted [m/s], within the limits of lanes; else the larger of the initial one and the middle of the goal's,
               or, where the goal has none, the limits, or, where there are none either, the initial one
     duration  [s]; else until the goal's last time or the last record of others
@@ -67,33 +71,33 @@ def commonroad(
     told = read(file)
     drivable = [key for key in told.lanes if for_cars(told.kinds[key])]
     given = problem_of(told, problem, start, goal, file)
-    path = path_of(told, drivable, given, start, file)
+    path = path_of(told, drivable, given, start, file) if route is None else path_along(told, drivable, route, given)
     last = max((float(o.time[-1]) for o in told.obstacles), default=math.inf) - given.time
     until = min([g.time[1] - given.time for g in given.goals] or [math.inf])
     lasting = duration if duration is not None else min(until, last)
     if not 0 < lasting < math.inf:
         raise InputError(f"{file}: the drive lasts {lasting:g} s; choose scenario.duration")
-    lanes, route = route_of(told.lanes, drivable, path)
-    wanted = wanted_speed(lanes, route, given, speed)
-    limits = [lanes[key].speed for key in route if math.isfinite(lanes[key].speed)]
-    route = onwards(lanes, drivable, route, lasting * min(max([*limits, given.start[3]]), wanted) + beyond)
-    route = backwards(lanes, drivable, route, BEHIND)
-    if not lanes[route[-1]].successors:
-        lanes, route = lengthened(lanes, route, beyond)
+    lanes, way = route_of(told.lanes, drivable, path)
+    wanted = wanted_speed(lanes, way, given, speed)
+    limits = [lanes[key].speed for key in way if math.isfinite(lanes[key].speed)]
+    way = onwards(lanes, drivable, way, lasting * min(max([*limits, given.start[3]]), wanted) + beyond)
+    way = backwards(lanes, drivable, way, BEHIND)
+    if not lanes[way[-1]].successors:
+        lanes, way = lengthened(lanes, way, beyond)
     most = max(limits, default=math.inf)  # of lanes on the way that tell none
-    lanes |= {key: lanes[key]._replace(speed=most) for key in route if math.isinf(lanes[key].speed)}
-    stops, lights = stops_of(told, lanes, drivable, way_along(lanes, route), given.time, lasting)
+    lanes |= {key: lanes[key]._replace(speed=most) for key in way if math.isinf(lanes[key].speed)}
+    stops, lights = stops_of(told, lanes, drivable, way_along(lanes, way), given.time, lasting)
     actors = tuple(actor_of(o, given.time, lasting, window) for o in told.obstacles)
     x, y, heading, v, a = map(float, given.start)
     ego = Pose(x - vehicle.middle * math.cos(heading), y - vehicle.middle * math.sin(heading), heading, v, a)
     return DriveScene(
         told.name,
         lanes,
-        tuple(route),
+        tuple(way),
         stops,
         lights,
         actors,
-        drivable_area(lanes, {*drivable, *route}, route, given.start, vehicle),
+        drivable_area(lanes, {*drivable, *way}, way, given.start, vehicle),
         ego,
         lasting,
         Noise(position=noise, speed=noise, heading=noise / 10),
@@ -116,6 +120,21 @@ def path_of(told: Recording, drivable: Sequence[int], given: Problem, start: int
             return path
     start_on, goal_on = (", ".join(map(str, keys)) for keys in (begins, ends))
     raise InputError(f"{file}: no way leads from lane {start_on} to the goal on lane {goal_on}")
+
+
+def path_along(told: Recording, drivable: Sequence[int], route: str, given: Problem) -> list[int]:
+    """Lanes of a route file, which must begin where the vehicle does."""
+    path = list(read_route(route))
+    for key in path:
+        if key not in drivable:
+            raise InputError(f"route file {route} names lane {key}, which is none that a car may drive on")
+    for before, here in pairwise(path):
+        if here not in (*told.lanes[before].successors, *neighbours(told.lanes, before, drivable)):
+            raise InputError(f"route file {route}: lane {here} neither follows lane {before} nor lies beside it")
+    if path[0] not in (begins := lanes_at(told.lanes, drivable, given.start[:2], float(given.start[2]))):
+        known = ", ".join(map(str, begins)) or "none"
+        raise InputError(f"route file {route} begins on lane {path[0]}, but the vehicle starts on lane {known}")
+    return path
 
 
 def for_cars(kinds: Collection[str]) -> bool:

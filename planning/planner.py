@@ -128,7 +128,7 @@ class Plan(NamedTuple):
     tier       comfort, relaxed, emergency
     clear      whether it breaks nothing within the horizon (an emergency stop may)
     cost       of its candidate
-    rejected   {reason: how many cheaper candidates were turned down for it}
+    rejected   {reason: how many cheaper candidates were turned down for it} (planning.check_kernel.REASONS)
     """
 
     line: ReferenceLine

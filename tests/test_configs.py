@@ -39,11 +39,12 @@ def hydra_context() -> Iterator[None]:
         yield
 
 
+DRIVES = ("driver", "planner")  # groups of the drive command alone
 DRIVEN = [("experiment", "commonroad")]  # experiments of the drive command
 
 
 @pytest.mark.parametrize(
-    ("group", "name"), [option for option in OPTIONS if option[0] != "planner" and option not in DRIVEN]
+    ("group", "name"), [option for option in OPTIONS if option[0] not in DRIVES and option not in DRIVEN]
 )
 def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: str) -> None:
     config = plain(compose("run", [f"{group}={name}"]))
@@ -53,7 +54,7 @@ def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: s
 
 
 @pytest.mark.parametrize(
-    ("group", "name"), [(g, n) for g, n in OPTIONS if g == "planner" or (g == "scenario" and n.startswith("drive_"))]
+    ("group", "name"), [(g, n) for g, n in OPTIONS if g in DRIVES or (g == "scenario" and n.startswith("drive_"))]
 )
 def test_every_config_of_a_drive_composes_and_builds_what_the_code_has_as_defaults(group: str, name: str) -> None:
     config = plain(compose("drive", [f"{group}={name}"]))

@@ -159,7 +159,10 @@ def report(
         "<h2>Cycles that could not be planned</h2>",
         table(("time [s]", "why"), stated),
         "<h2>Candidates turned down</h2>",
-        table(("reason", "candidates cheaper than the plan, over all cycles"), sorted(turned_down.items(), key=lambda item: -item[1])),
+        table(
+            ("reason", "candidates cheaper than the plan, over all cycles"),
+            sorted(turned_down.items(), key=lambda item: -item[1]),
+        ),
         "<h2>What was thought</h2>",
         table(("from [s]", "thought"), thought),
         "<h2>Time</h2>",

@@ -116,12 +116,13 @@ def colours_of(fan: Fan) -> dict[int, str]:
 
 
 def candidate_handles(fan: Fan, colours: dict[int, str]) -> list[Line2D]:
-    """For the legend, with numbers."""
+    """For the legend, with numbers; reasons of one colour are one entry."""
     order = sorted(fan.numbers, key=lambda reason: (reason != 0, -fan.numbers[reason]))
-    return [
-        Line2D([], [], color=colours[r], lw=1.4, label=f"{REASONS[r] if r else 'good'}: {fan.numbers[r]}")
-        for r in order
-    ]
+    rest = [r for r in order if colours[r] == REST]
+    told = [(colours[r], REASONS[r] if r else "good", fan.numbers[r]) for r in order if r not in rest]
+    if rest:
+        told.append((REST, REASONS[rest[0]] if len(rest) == 1 else "other reasons", sum(fan.numbers[r] for r in rest)))
+    return [Line2D([], [], color=colour, lw=1.4, label=f"{name}: {number}") for colour, name, number in told]
 
 
 def draw_cycle(axes: Axes, drive: Drive, number: int, fan: Fan, colours: dict[int, str]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from experiments.signatures import ConfigError
 from experiments.store import check_folder
 
 ROOT = Path(__file__).resolve().parents[1]
+OTHER_COMMAND = re.compile(r"In '(\w+)/(\w+)': Could not override '/?(\w+)'\. No match")
 
 
 class SchemaLoader(ConfigLoaderImpl):
@@ -104,6 +106,12 @@ def in_words(error: BaseException) -> str | None:
         return _missing(error)
     if isinstance(error, OverrideParseException):
         return f"cannot read the setting '{error.override}'; write key=value, and quote what the shell would split"
+    if (other := OTHER_COMMAND.match(str(error))) is not None and isinstance(error, HydraException):
+        group, name, part = other.groups()
+        return (
+            f"{group}={name} chooses a {part}, which this command has not: it is of another one "
+            "(`waybayes` runs, `python -m experiments.drive` drives)"
+        )
     if isinstance(error, HydraException | OmegaConfBaseException):
         causes: list[BaseException] = [error]
         while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:

@@ -4,7 +4,8 @@
     python -m experiments.drive -m scenario=drive_follow,drive_merge     a sweep; what is done already is skipped
     python -m experiments.drive scenario=drive_follow --cfg job          shows every setting, drives nothing
 
-A scenario is any callable that returns a DriveScene (experiments.scenarios.driving); `drive` of experiments.closed_loop
+A scenario is any callable that returns a DriveScene (experiments.scenarios.driving), a driver any callable that returns
+a Mind (experiments.closed_loop); examples/cyclist_ahead has one of each. `drive` of experiments.closed_loop
 is the same for use from Python, where nothing is stored.
 """
 
@@ -173,7 +174,10 @@ def report(
         "<h2>Cycles that could not be planned</h2>",
         table(("time [s]", "why"), stated),
         "<h2>Candidates turned down</h2>",
-        table(("reason", "candidates"), sorted(turned_down.items(), key=lambda item: -item[1])),
+        table(
+            ("reason", "candidates cheaper than the plan, over all cycles"),
+            sorted(turned_down.items(), key=lambda item: -item[1]),
+        ),
         *(["<h2>Cycles that were not refined</h2>", table(("why", "cycles"), unrefined)] if unrefined else []),
         "<h2>What was thought</h2>",
         table(("from [s]", "thought"), thought),

@@ -51,6 +51,8 @@ def by_the_rules(
             lines=scene.boundary,
         )
         decided = permissions.memory
-        return Thought(given, "; ".join([behaved.goal, *(f"{k}: {why}" for k, why in permissions.reasons.items())]))
+        passing = [f"passing {behaved.passing.blocker}"] if behaved.passing.going else []
+        why = [f"{name}: {reason}" for name, reason in permissions.reasons.items()]
+        return Thought(given, "; ".join([behaved.goal, *passing, *why]))
 
     return think

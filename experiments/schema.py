@@ -152,7 +152,8 @@ def build(node: Any, path: str = "") -> Any:
     for name, knob in _settable(node).items():
         value = node.get(name, MISSING)
         if value == MISSING and knob.required:
-            raise ConfigError(f"{path}.{name} has no value; give one with {path}.{name}=...")
+            later = f", or _partial_: true in {path} if the command gives it" if name in SUPPLIED else ""
+            raise ConfigError(f"{path}.{name} has no value; give one with {path}.{name}=...{later}")
         if value != MISSING:
             value = build(value, f"{path}.{name}")
             arguments[name] = _as_tuples(value) if knob.is_tuple else value

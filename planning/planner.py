@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from models.program import InputError
 from planning import candidates
-from planning.candidates import Fans, Goal, Keep, Lateral, Longitudinal, Weights
+from planning.candidates import Fans, Goal, Keep, Lateral, Longitudinal, Reach, Weights
 from planning.frenet import FrenetState, to_pose, to_poses
 from planning.kinematics import LIMITS, Limits
 from planning.polynomials import Polynomials, quartics
@@ -109,6 +109,15 @@ class Scene(NamedTuple):
     stand: float = math.inf
 
 
+PARTS: dict[str, tuple[type, ...]] = {
+    "line": (ReferenceLine,),
+    "state": (FrenetState,),
+    "goal": (Keep, Reach),
+    "boundary": (Boundary,),
+    "obstacles": (Obstacles,),
+}
+
+
 class Candidates(NamedTuple):
     """All n x m of them, cheapest first in `order`; `reason` each is bad for (planning.check_kernel.REASONS), -1 where
     none was asked for; `when` it arises [steps]; `best` the cheapest good one, or -1."""
@@ -128,7 +137,7 @@ class Plan(NamedTuple):
     tier       comfort, relaxed, emergency
     clear      whether it breaks nothing within the horizon (an emergency stop may)
     cost       of its candidate
-    rejected   {reason: how many cheaper candidates were turned down for it}
+    rejected   {reason: how many cheaper candidates were turned down for it} (planning.check_kernel.REASONS)
     """
 
     line: ReferenceLine
@@ -341,6 +350,10 @@ def turned_down(judged: Candidates) -> dict[str, int]:
 
 def check(planner: Planner, scene: Scene) -> None:
     """Raises InputError for a scene that no plan can be made for, in words."""
+    for name, kinds in PARTS.items():
+        if not isinstance(part := getattr(scene, name), kinds):
+            words = " or ".join(kind.__name__ for kind in kinds)
+            raise InputError(f"scene: {name} is of type {type(part).__name__}, but must be {words}")
     for name, value in zip(scene.state._fields, scene.state, strict=True):
         if not abs(value) < LARGEST:
             raise InputError(f"the vehicle's state has {name} = {value}")
@@ -369,8 +382,9 @@ def check(planner: Planner, scene: Scene) -> None:
             f"{planner.radius:.2f} m; build them with that reach"
         )
     for name in ("stop", "stand"):
-        if math.isnan(getattr(scene, name)):
-            raise InputError(f"scene: {name} is NaN; infinity means none")
+        value = getattr(scene, name)
+        if value is None or math.isnan(value):
+            raise InputError(f"scene: {name} is {value}; infinity means none")
     check_obstacles(scene.obstacles, planner.num_steps)
 
 

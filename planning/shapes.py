@@ -160,6 +160,9 @@ def no_obstacles(num_steps: int) -> Obstacles:
 def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
     """Raises InputError for wrong shapes, NaN, sizes that are not positive, covariances that are not symmetric or have
     negative eigenvalues, and probabilities outside [0, 1]."""
+    for name, value in obstacles._asdict().items():
+        if not isinstance(value, np.ndarray):
+            raise InputError(f"obstacles: {name} is a {type(value).__name__}, but must be an array")
     num = len(obstacles.pose)
     wanted = {
         "pose": (num, num_steps, 3),
@@ -168,7 +171,7 @@ def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
         "probability": (num,),
     }
     for name, shape in wanted.items():
-        found = np.asarray(getattr(obstacles, name))
+        found = getattr(obstacles, name)
         if found.shape != shape:
             raise InputError(f"obstacles: {name} has shape {found.shape}, but must be {shape}")
         if not np.isfinite(found).all():

@@ -282,7 +282,7 @@ def test_lights_and_lines_are_stop_points(write: Any) -> None:
 def test_scenarios_that_cannot_be_driven_are_one_sentence(write: Any) -> None:
     for knobs, sentence in (
         ({"problem": 9}, "scenario.problem is 9, but the planning problems are 5"),
-        ({"start": 77}, "scenario.start is 77, but there is no such lane"),
+        ({"start": 77}, "scenario.start is 77, but there is no such lane; cars may drive on 1, 2"),
         ({"goal": 3, "start": 2}, "no way leads from lane 2 to the goal on lane 3"),
         ({"duration": -1.0}, "scenario.duration is -1.0"),
     ):
@@ -290,8 +290,11 @@ def test_scenarios_that_cannot_be_driven_are_one_sentence(write: Any) -> None:
             commonroad(write(OLD), **knobs)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="on no lane that a car may drive"):
         commonroad(write(OLD.replace("<x>20</x><y>0</y>", "<x>20</x><y>50</y>")))
-    with pytest.raises(InputError, match="no planning problem; choose a lane"):
+    with pytest.raises(InputError, match=r"no planning problem; choose a lane as scenario.start \(1, 2.*\), and"):
         commonroad(write(OLD[: OLD.index("<planningProblem")] + "</commonRoad>"))
+    empty = OLD[: OLD.index("<obstacle")] + "</commonRoad>"
+    with pytest.raises(InputError, match="no goal and no road user says when the drive ends"):
+        commonroad(write(empty), start=1)
 
 
 def test_a_route_file_is_driven_along(write: Any, tmp_path: Path) -> None:

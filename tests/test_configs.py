@@ -39,11 +39,12 @@ def hydra_context() -> Iterator[None]:
         yield
 
 
+DRIVES = ("driver", "planner")  # groups of the drive command alone
 DRIVEN = [("experiment", "commonroad")]  # experiments of the drive command
 
 
 @pytest.mark.parametrize(
-    ("group", "name"), [option for option in OPTIONS if option[0] != "planner" and option not in DRIVEN]
+    ("group", "name"), [option for option in OPTIONS if option[0] not in DRIVES and option not in DRIVEN]
 )
 def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: str) -> None:
     config = plain(compose("run", [f"{group}={name}"]))
@@ -53,7 +54,7 @@ def test_every_config_composes_and_its_targets_take_the_keys(group: str, name: s
 
 
 @pytest.mark.parametrize(
-    ("group", "name"), [(g, n) for g, n in OPTIONS if g == "planner" or (g == "scenario" and n.startswith("drive_"))]
+    ("group", "name"), [(g, n) for g, n in OPTIONS if g in DRIVES or (g == "scenario" and n.startswith("drive_"))]
 )
 def test_every_config_of_a_drive_composes_and_builds_what_the_code_has_as_defaults(group: str, name: str) -> None:
     config = plain(compose("drive", [f"{group}={name}"]))
@@ -63,6 +64,23 @@ def test_every_config_of_a_drive_composes_and_builds_what_the_code_has_as_defaul
         assert isinstance(build(config["scenario"], "scenario"), DriveScene)
     assert (parts["planner"], parts["loop"]) == (Planner(), Loop())
     assert parts["driver"].keywords == {"situation": Situation(), "rules": Rules(), "manners": Manners()}
+
+
+def test_a_driver_without_manners_leaves_the_metrics_their_defaults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "outside_driver.py").write_text("def idle(scene, route, planner, *, speed: float = 3.0): ...\n")
+    (tmp_path / "driver").mkdir()
+    (tmp_path / "driver" / "idle.yaml").write_text("_target_: outside_driver.idle\n_partial_: true\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    search = [f"hydra.searchpath=[file://{tmp_path}]", "driver=idle"]
+    for words in ([], ["experiment=commonroad", "scenario.file=some.xml"]):
+        config = plain(compose("drive", [*search, *words]))
+        assert config["driver"]["speed"] == 3.0
+        signature = inspect.signature(locate(config["metrics"][0]["_target_"])).parameters
+        told = {key: config["metrics"][0][key] for key in ("gap", "headway")}
+        assert told == {key: signature[key].default for key in told}
+    assert plain(compose("drive", ["driver.manners.gap=7"]))["metrics"][0]["gap"] == 7.0
 
 
 @pytest.mark.parametrize(("group", "name"), DRIVEN)
@@ -200,6 +218,15 @@ def test_a_missing_value_is_asked_for_by_name(tmp_path: Path, monkeypatch: pytes
         build(plain(config))
     config.scenario.path = "x.csv"
     assert build(plain(config))["scenario"] == ("x.csv", 3)
+
+
+def test_what_the_command_gives_is_asked_for_with_the_word_that_was_forgotten() -> None:
+    config = OmegaConf.create({"driver": {"_target_": "experiments.driver.by_the_rules"}})
+    expand(config)
+    with pytest.raises(
+        ConfigError, match=r"driver.scene has no value; .*, or _partial_: true in driver if the command"
+    ):
+        build(plain(config))
 
 
 def test_a_target_that_does_not_exist_is_named() -> None:

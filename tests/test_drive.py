@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.closed_loop import Drive, Loop, Mind, Thought, drive, stop_along
-from experiments.closed_loop_figures import figures
+from experiments.closed_loop_figures import Fan, candidate_handles, colours_of, figures
 from experiments.closed_loop_metrics import contacts, gap_error, metrics, stop_error, violations
 from experiments.driver import by_the_rules
 from experiments.run import check_read
@@ -333,6 +333,19 @@ def test_pictures_have_axes_with_units_and_a_legend(driven: dict[str, Drive]) ->
         assert drawn["drive"].axes[-1].get_xlabel() == "time [s]"
 
 
+def test_reasons_of_one_colour_are_one_entry_of_the_legend() -> None:
+    none, fan = np.zeros(0), {reason: 100 - reason for reason in range(10)}
+    told = Fan(np.zeros((0, 2, 2)), none.astype(np.int64), fan)
+    handles = candidate_handles(told, colours_of(told))
+    assert len({handle.get_color() for handle in handles}) == len(handles) == 8
+    assert handles[0].get_label() == "good: 100" and handles[-1].get_label() == "other reasons: 276"
+
+
+def test_who_is_passed_is_told(driven: dict[str, Drive]) -> None:
+    words = driven["parked_car, nobody comes"].log.words
+    assert words[0] == "keep" and "keep; passing 0" in words.tolist()
+
+
 def test_a_drive_by_command_is_stored_whole_and_not_repeated(launch: Command) -> None:
     words = ["scenario=drive_box", "scenario.duration=1.5", "figures=[]"]
     done = launch(*words, module="experiments.drive")
@@ -358,6 +371,8 @@ def test_a_drive_by_command_is_stored_whole_and_not_repeated(launch: Command) ->
         ("drive", ["planner.riks=1"], "planner has no knob 'riks'; did you mean 'risk'?"),
         ("drive", ["planner.comfort.braking=9"], "comfort.braking is 9.0, more than the vehicle can"),
         ("drive", ["seed=-1"], "seed is -1; choose 0 or more"),
+        ("drive", ["experiment=demo"], "experiment=demo chooses a model, which this command has not"),
+        ("run", ["experiment=commonroad"], "experiment=commonroad chooses a planner, which this command has not"),
         ("run", ["scenario=drive_box"], "`python -m experiments.drive` drives it"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The package under examples/ runs through `waybayes` without a change to the tree."""
+"""The packages under examples/ run through `waybayes` and the drive command without a change to the tree."""
 
 from __future__ import annotations
 
@@ -68,6 +68,38 @@ def test_scans_of_a_sensor_outside_the_tree_are_tracked(monkeypatch: pytest.Monk
         nearest = int(np.abs(gap[:, :2]).sum(1).argmin())
         std = np.sqrt(np.diagonal(last.covariance[nearest])[entries])
         assert (np.abs(gap[nearest]) < 4.0 * std).all()
+
+
+def test_a_street_and_a_driver_outside_the_tree_are_driven(tmp_path: Path) -> None:
+    """He keeps 8 m and 1.5 s at the cyclist's 4 m/s to his metric's zero, and never stops for good."""
+    runs = tmp_path / "runs"
+    command = [sys.executable, "-m", "experiments.drive", "hydra.searchpath=[pkg://cyclist_ahead.configs]"]
+    words = ["experiment=patient_street", "figures=[]", f"runs={runs}"]
+    place = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
+    done = subprocess.run([*command, *words], cwd=EXAMPLES, env=place, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    (result,) = runs.glob("street-frenet-*")
+    scores = json.loads((result / "scores.json").read_text())
+    assert scores["collisions"] == scores["limit_violations"] == scores["emergency"] == 0.0
+    assert scores["gap_error_m"] < 1e-3 and abs(scores["end_speed_mps"] - 4.0) < 1e-3
+    assert scores["clearance_m"] == pytest.approx(8.0 + 1.5 * 4.0, abs=1e-3)
+
+
+def test_one_cycle_from_plain_arrays_passes_the_cyclist_and_stops_at_the_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    from cyclist_ahead.plan_once import LINE, planned
+
+    found, better = planned()
+    assert found.clear and found.rejected["other road user"] > 0
+    assert better.accepted and better.cost < found.cost
+    poses = better.trajectory(np.arange(0.0, 9.0, 0.05))
+    front = poses[:, 0] + 1.4 + 4.9 / 2 * np.cos(poses[:, 2])
+    assert (front[:61] < LINE).all()  # beyond the horizon the line is a target
+    assert front[-1] == pytest.approx(LINE, abs=0.01) and abs(poses[-1, 3]) < 1e-6
+    beside = np.abs(poses[:, 0] + 1.4 - 45.0) < 0.9 + 4.9 / 2
+    assert (poses[beside, 1] - 1.9 / 2 > -1.5 + 0.6 / 2).all()
 
 
 def test_example_keeps_to_the_seam_in_forty_lines(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 from models.program import InputError
 from planning.candidates import Goal, Keep, Reach, follow, merge, stop
 from planning.check_kernel import REASONS
-from planning.frenet import FrenetState
+from planning.frenet import FrenetState, Pose
 from planning.kinematics import KINEMATICS, LIMITS, MARGINS, Limits
 from planning.planner import COMFORT, EMERGENCY, RELAXED, Plan, Planner, Scene, candidates_of, judge, judge_states, plan
 from planning.polynomials import NOTHING, Polynomials
@@ -270,10 +270,10 @@ def test_unlikely_and_uncertain_road_users() -> None:
         ({"state": START._replace(s=-0.1)}, "choose a longer one"),
         ({"offsets": np.zeros((2, 2))}, "one or more numbers"),
         ({"wanted": math.nan}, "one or more numbers"),
-        ({"stand": math.nan}, "stand is NaN"),
+        ({"stand": math.nan}, "stand is nan; infinity means none"),
         ({"offsets": np.zeros(0)}, "one or more numbers"),
         ({"boundary": boundary([], 0.5)}, "build them with that reach"),
-        ({"stop": math.nan}, "stop is NaN"),
+        ({"stop": math.nan}, "stop is nan; infinity means none"),
         ({"obstacles": rectangle(40, 0)._replace(size=np.array([[4.0, -1.0]]))}, "obstacle 0: its size"),
         ({"obstacles": rectangle(40, 0)._replace(probability=np.array([1.5]))}, "between 0 and 1"),
         ({"obstacles": rectangle(40, 0)._replace(size=np.array([[4.0, 0.0]]))}, "obstacle 0: its size"),
@@ -281,6 +281,12 @@ def test_unlikely_and_uncertain_road_users() -> None:
         ({"obstacles": rectangle(40, 0, math.nan)}, "obstacle 0: pose is not finite"),
         ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), [[1, 0.5], [0, 1]]))}, "symmetric"),
         ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), -np.eye(2)))}, "negative eigen"),
+        ({"stop": None}, "stop is None; infinity means none"),
+        ({"state": Pose(25.0, 0.0, 0.0, 9.0)}, "state is of type Pose, but must be FrenetState"),
+        ({"goal": 9.0}, "goal is of type float, but must be Keep or Reach"),
+        ({"line": np.zeros((9, 2))}, "line is of type ndarray, but must be ReferenceLine"),
+        ({"obstacles": None}, "obstacles is of type NoneType, but must be Obstacles"),
+        ({"obstacles": no_obstacles(60)._replace(size=[[2.0, 1.0]])}, "size is a list, but must be an array"),
         ({"obstacles": no_obstacles(7)}, "must be \\(0, 60, 3\\)"),
     ],
 )

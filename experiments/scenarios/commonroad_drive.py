@@ -30,6 +30,7 @@ ROOM = 0.5  # around where the vehicle starts [m]
 NEARBY = 10.0  # of the route, where the edge of what may be driven on counts [m]
 FEWEST = 3  # states that tell an acceleration
 SLOWEST = 1.0  # speed wanted of who starts at rest and has nothing else to go by [m/s]
+NAMED = 8  # lanes in a sentence about lanes, at most
 BEHIND = 30.0  # of the route, behind where it begins [m]
 
 
@@ -70,13 +71,15 @@ def commonroad(
         raise InputError(f"scenario.noise is {noise}, but must be 0 or more [m, m/s]")
     told = read(file)
     drivable = [key for key in told.lanes if for_cars(told.kinds[key])]
-    given = problem_of(told, problem, start, goal, file)
+    given = problem_of(told, drivable, problem, start, goal, file)
     path = path_of(told, drivable, given, start, file) if route is None else path_along(told, drivable, route, given)
     last = max((float(o.time[-1]) for o in told.obstacles), default=math.inf) - given.time
     until = min([g.time[1] - given.time for g in given.goals] or [math.inf])
     lasting = duration if duration is not None else min(until, last)
-    if not 0 < lasting < math.inf:
-        raise InputError(f"{file}: the drive lasts {lasting:g} s; choose scenario.duration")
+    if lasting == math.inf:
+        raise InputError(f"{file}: no goal and no road user says when the drive ends; choose scenario.duration [s]")
+    if not lasting > 0:
+        raise InputError(f"{file}: the drive lasts {lasting:g} s; choose scenario.duration [s]")
     lanes, way = route_of(told.lanes, drivable, path)
     wanted = wanted_speed(lanes, way, given, speed)
     limits = [lanes[key].speed for key in way if math.isfinite(lanes[key].speed)]
@@ -143,16 +146,19 @@ def for_cars(kinds: Collection[str]) -> bool:
     return not NOT_FOR_CARS & set(kinds) and (not users or bool(users & {"for car", "for vehicle"}))
 
 
-def problem_of(told: Recording, problem: int | None, start: int | None, goal: int | None, file: str) -> Problem:
+def problem_of(
+    told: Recording, drivable: Sequence[int], problem: int | None, start: int | None, goal: int | None, file: str
+) -> Problem:
     """The planning problem that is asked for, or one made of a lane to start on and a lane to reach."""
+    some = ", ".join(map(str, drivable[:NAMED])) + (", ..." if len(drivable) > NAMED else "")
     for name, key in (("start", start), ("goal", goal)):
         if key is not None and key not in told.lanes:
-            raise InputError(f"{file}: scenario.{name} is {key}, but there is no such lane")
+            raise InputError(f"{file}: scenario.{name} is {key}, but there is no such lane; cars may drive on {some}")
     if start is None:
         known = ", ".join(map(str, told.problems)) or "none"
         if not told.problems:
             raise InputError(
-                f"{file}: it has no planning problem; choose a lane as scenario.start, and scenario.duration"
+                f"{file}: it has no planning problem; choose a lane as scenario.start ({some}), and scenario.duration"
             )
         key = next(iter(told.problems)) if problem is None else problem
         if key not in told.problems:

@@ -165,7 +165,7 @@ def drive(
         tracks = observe(scene, others, rng)
         try:
             state = _start(way, ego, followed, cycle, loop.tolerance)
-            given, words = think(now, state, tracks)
+            given, words = _thought(think(now, state, tracks))
             found = plan(planner, given, made, cycle)
             if loop.refine:
                 better = refine(planner, given, found, better, cycle, solve=found.tier != EMERGENCY)
@@ -192,6 +192,13 @@ def drive(
                 looks.append(others)
     driven.append((ego, poses[-1], told))
     return Drive(scene, way, planner, _log(scene, loop, driven, looks, cycles, planned), givens, plans)
+
+
+def _thought(found: Any) -> Thought:
+    """What a driver made of a cycle. Raises InputError where it is something else."""
+    if not isinstance(found, Thought):
+        raise InputError(f"the driver answered with a {type(found).__name__}; return experiments.closed_loop.Thought")
+    return found
 
 
 def stop_along(planner: Planner, last: Plan | Refined, elapsed: float) -> Plan:

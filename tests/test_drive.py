@@ -201,6 +201,8 @@ def test_a_scene_that_cannot_be_begun_is_refused() -> None:
         drive(scene._replace(route=(7,)), steady())
     with pytest.raises(InputError, match="nothing is seen"):
         drive(scene, steady(fails=(0.0, 1.0)))
+    with pytest.raises(InputError, match=r"answered with a NoneType; return experiments.closed_loop.Thought"):
+        drive(scene, lambda *given: lambda *seen: None)  # type: ignore[arg-type, return-value]
 
 
 def test_a_vehicle_off_its_plan_is_planned_from_where_it_is() -> None:

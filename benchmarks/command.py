@@ -10,7 +10,8 @@ import argparse
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from importlib import import_module
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -38,6 +39,19 @@ class Benchmark(NamedTuple):
     title: str
     measurements: Callable[[], tuple[fig.Measurement, ...]]
     efforts: Callable[[], tuple[Any, Any]]
+
+
+def in_parts(name: str, title: str, parts: Sequence[str], trials: str) -> Benchmark:
+    """The command whose modules benchmarks.PART each have MEASUREMENTS; FULL and QUICK are in benchmarks.TRIALS."""
+
+    def measurements() -> tuple[fig.Measurement, ...]:
+        return tuple(m for part in parts for m in import_module(f"benchmarks.{part}").MEASUREMENTS)
+
+    def efforts() -> tuple[Any, Any]:
+        told = import_module(f"benchmarks.{trials}")
+        return told.FULL, told.QUICK
+
+    return Benchmark(name, title, measurements, efforts)
 
 
 def select(every: tuple[fig.Measurement, ...], only: list[str]) -> list[fig.Measurement]:

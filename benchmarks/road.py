@@ -10,35 +10,18 @@ the calibrated range was chosen on other seeds (python -m benchmarks.road_cut)."
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from typing import Any
 
 from benchmarks import command
-from benchmarks import figure as fig
 
-if TYPE_CHECKING:
-    from benchmarks.road_trials import Effort
-
-
-def measurements() -> tuple[fig.Measurement, ...]:
-    """All measurements but the yardstick, in the order of the table."""
-    from benchmarks import road_accuracy, road_robust, road_segments, road_speed
-
-    parts = (road_accuracy, road_robust, road_segments, road_speed)
-    return tuple(m for part in parts for m in part.MEASUREMENTS)
+PARTS = ("road_accuracy", "road_robust", "road_segments", "road_speed")
+BENCHMARK = command.in_parts("benchmarks.road", "Roads against [T17]", PARTS, "road_trials")
+measurements = BENCHMARK.measurements
 
 
-def efforts() -> tuple[Effort, Effort]:
-    """The full one and the quick one."""
-    from benchmarks.road_trials import FULL, QUICK
-
-    return FULL, QUICK
-
-
-def main(words: list[str] | None = None, effort: Effort | None = None) -> int:
+def main(words: list[str] | None = None, effort: Any = None) -> int:
     """The command; `effort` replaces both --quick and the full one. Returns the exit code."""
-    return command.main(
-        command.Benchmark("benchmarks.road", "Roads against [T17]", measurements, efforts), words, effort
-    )
+    return command.main(BENCHMARK, words, effort)
 
 
 if __name__ == "__main__":

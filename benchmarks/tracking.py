@@ -10,35 +10,18 @@ same scans in the same process; its settings were chosen on other scenes (python
 from __future__ import annotations
 
 import sys
-from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import Any
 
 from benchmarks import command
-from benchmarks import figure as fig
-
-if TYPE_CHECKING:
-    from benchmarks.tracking_trials import Effort
 
 PARTS = ("tracking_speed", "tracking_peers", "tracking_accuracy", "kitti_tracking", "kitti_baseline")
+BENCHMARK = command.in_parts("benchmarks.tracking", "Tracking against [K15]", PARTS, "tracking_trials")
+measurements = BENCHMARK.measurements
 
 
-def measurements() -> tuple[fig.Measurement, ...]:
-    """All measurements but the yardstick, in the order of the table."""
-    return tuple(m for part in PARTS for m in import_module(f"benchmarks.{part}").MEASUREMENTS)
-
-
-def efforts() -> tuple[Effort, Effort]:
-    """The full one and the quick one."""
-    from benchmarks.tracking_trials import FULL, QUICK
-
-    return FULL, QUICK
-
-
-def main(words: list[str] | None = None, effort: Effort | None = None) -> int:
+def main(words: list[str] | None = None, effort: Any = None) -> int:
     """The command; `effort` replaces both --quick and the full one. Returns the exit code."""
-    return command.main(
-        command.Benchmark("benchmarks.tracking", "Tracking against [K15]", measurements, efforts), words, effort
-    )
+    return command.main(BENCHMARK, words, effort)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
 ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
 ANY = Limits(*(1e9,) * 7)  # no limits but those of geometry
 LARGEST = 1e6  # of what a state or a goal tells: powers of more overflow
+FAR = 0.05  # of an equal share of the risk, for road users that a candidate does not come near to
 SLOWEST = 0.05  # [m/s] above which a motion told by time tells a direction
 
 
@@ -311,7 +312,7 @@ def _judged(
         scene.stand - vehicle.front,
         limits.braking,
         tuple(scene.boundary[:6]),
-        rectangles(planner, scene),
+        *uncertain(planner, scene),
         vehicle.middle,
         vehicle.circles,
         planner.radius,
@@ -322,12 +323,25 @@ def _judged(
     return best, reason, when
 
 
-def rectangles(planner: Planner, scene: Scene) -> Floats:
-    """The obstacles' table, with the planner's risk shared among them."""
+def rectangles(planner: Planner, scene: Scene, part: float = 1.0) -> Floats:
+    """The obstacles' table, with this part of the planner's risk shared among them in equal shares."""
     vehicle = planner.vehicle
     reach = math.hypot(vehicle.length / 2, vehicle.width / 2) + planner.radius  # generous: circles stand out
-    each = planner.risk / max(len(scene.obstacles.probability), 1)
+    each = part * planner.risk / max(len(scene.obstacles.probability), 1)
     return scene.obstacles.table(each, planner.radius, reach)
+
+
+def uncertain(planner: Planner, scene: Scene) -> tuple[Floats, tuple[float, Floats, Floats, Floats]]:
+    """Rectangles and chances of planning.check_kernel.first_rectangle: each candidate has the whole risk for those that
+    it comes near to, less FAR of an equal share for any other. What is clear with equal shares is so here, too."""
+    from scipy.special import ndtri
+
+    told, chance = rectangles(planner, scene, FAR), scene.obstacles.probability
+    each = FAR * planner.risk / max(len(chance), 1)
+    likely = chance[chance > each]
+    risk = planner.risk - each * (len(chance) - len(likely))
+    alone = -ndtri(np.minimum(risk / likely, 1.0))
+    return told, (risk, likely, alone, np.full(len(likely), each))
 
 
 def turned_down(judged: Candidates) -> dict[str, int]:

@@ -16,7 +16,7 @@ from planning.kinematics import KINEMATICS, LIMITS, MARGINS, Limits
 from planning.planner import COMFORT, EMERGENCY, RELAXED, Plan, Planner, Scene, candidates_of, judge, judge_states, plan
 from planning.polynomials import NOTHING, Polynomials
 from planning.reference import from_curvature
-from planning.shapes import CLEARANCE, Obstacles, Vehicle, boundary, no_obstacles
+from planning.shapes import CLEARANCE, SIGMAS, Obstacles, Vehicle, boundary, no_obstacles
 
 PLANNER = Planner()
 S = np.arange(0.0, 301.0, 0.5)
@@ -131,7 +131,8 @@ def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) ->
     import shapely
 
     lines = shapely.multilinestrings([shapely.linestrings(part.reshape(2, 2)) for part in given.boundary.segment])
-    rectangles = given.obstacles.table(planner.risk / max(len(given.obstacles.pose), 1), radius, 10.0)
+    rectangles = given.obstacles.table(1e-12, radius, 10.0)
+    chance = np.zeros((len(rectangles), planner.num_steps))
     from planning.frenet import to_pose
 
     if (margins[:, :10] < 0).any():
@@ -148,9 +149,13 @@ def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) ->
         centres = xy[k] + vehicle.circles[:, None] * [np.cos(heading[k]), np.sin(heading[k])]
         if (shapely.distance(shapely.points(centres), lines) <= radius).any():
             return "boundary line"
-        for r in rectangles[..., k]:
-            if (CLEARANCE(centres, np.array([[*r[:10], radius]])) <= 0).any():
-                return "other road user"
+        for m, r in enumerate(rectangles[..., k]):
+            z = float(SIGMAS(centres, np.array([[*r[:9], radius]])).min())
+            chance[m, k] = given.obstacles.probability[m] * 0.5 * math.erfc(z / math.sqrt(2))
+        if (chance[:, k] > planner.risk).any():
+            return "other road user"
+    if chance.max(1, initial=0.0).sum() > planner.risk:
+        return "other road user"
     if s[-1] + ds[-1] ** 2 / (2 * limits.braking) > given.stand - vehicle.front:
         return "cannot stop beyond the horizon"
     return "none"

@@ -4,6 +4,9 @@
     relaxed      the same within what the vehicle can do
     emergency    a stop: the cheapest that is clear, else the one that does least harm
 
+A vehicle at rest where it may be stays there, comfortably, if it finds nothing good, even where others may come and
+touch it: `clear` tells.
+
 [K15], section IV-C: horizon 3 s, 20 Hz, every 150 ms; |a_lat| <= 2 m/s^2.
 """
 
@@ -32,6 +35,7 @@ COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
 ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
 ANY = Limits(*(1e9,) * 7)  # no limits but those of geometry
 LARGEST = 1e6  # of what a state or a goal tells: powers of more overflow
+AT_REST = 1e-3  # [m/s] below which a vehicle stands
 FAR = 0.05  # of an equal share of the risk, for road users that a candidate does not come near to
 SLOWEST = 0.05  # [m/s] above which a motion told by time tells a direction
 
@@ -127,7 +131,7 @@ class Plan(NamedTuple):
     """A motion from `start` on and how it was come by.
 
     tier       comfort, relaxed, emergency
-    clear      whether it breaks nothing within the horizon (an emergency stop may)
+    clear      whether it breaks nothing within the horizon (an emergency stop may, and others who stands)
     cost       of its candidate
     rejected   {reason: how many cheaper candidates were turned down for it}
     """
@@ -198,6 +202,8 @@ def plan(
     all_reasons        judge every candidate, not only those cheaper than the best: for pictures
 
     Raises InputError for a scene that is not one (shapes, NaN); anything else is answered with a plan."""
+    from planning.check_kernel import GOOD, OBSTACLE
+
     check(planner, scene)
     made = candidates_of(planner, scene, previous, elapsed)
     judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
@@ -209,7 +215,8 @@ def plan(
         return chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
     stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able)
     best = stops.best if stops.best >= 0 else least_harm(planner, scene, stops)
-    return chosen(scene, stops, best, EMERGENCY, rejected)
+    stays = abs(scene.state.ds) < AT_REST and stops.reason[best] in (GOOD, OBSTACLE)
+    return chosen(scene, stops, best, COMFORT if stays else EMERGENCY, rejected)
 
 
 def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0) -> Candidates:

@@ -255,6 +255,18 @@ def test_a_standing_vehicle_starts() -> None:
     assert found.tier == COMFORT and found.states([3.0])[0].ds > 3.0
 
 
+def test_who_stands_stays_without_an_emergency_whoever_comes() -> None:
+    """Somebody drives at it from ahead, another stands behind: nothing is clear, and there is nothing to brake for."""
+    given = scene(FrenetState(20.0, 0.0, 0.0, 0.0), Keep(8.0), obstacles=rectangle(32.0, 0.0, -6.0))
+    found = plan(PLANNER, given)
+    assert (found.tier, found.clear) == (COMFORT, False) and found.rejected["other road user"] > 0
+    assert found.along(np.arange(0.0, 3.0, 0.05))[:, 0].max() == pytest.approx(20.0, abs=1e-9)
+    on_a_kerb = boundary([LINE.place([18.0, 24.0], 0.5)], PLANNER.radius)
+    assert plan(PLANNER, given._replace(boundary=on_a_kerb)).tier == EMERGENCY, "it may not be where it is"
+    moving = plan(PLANNER, given._replace(state=FrenetState(20.0, 0.5, 0.0, 0.0)))
+    assert (moving.tier, moving.clear) == (EMERGENCY, False)
+
+
 def test_unlikely_and_uncertain_road_users() -> None:
     beside = scene(START._replace(d=0.0), Keep(10.0), offsets=np.array([0.0]), obstacles=rectangle(40.0, 2.6, 0.0))
     assert plan(PLANNER, beside).states([3.0])[0].ds == pytest.approx(10.0)

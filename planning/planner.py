@@ -207,6 +207,9 @@ def plan(
     check(planner, scene)
     made = candidates_of(planner, scene, previous, elapsed)
     judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
+    if judged.best < 0 and scene.state.ds >= planner.fans.slow:
+        made = candidates_of(planner, scene, previous, elapsed, both=True)
+        judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
     rejected = turned_down(judged)
     if judged.best >= 0:
         return chosen(scene, judged, judged.best, COMFORT, rejected)
@@ -219,16 +222,30 @@ def plan(
     return chosen(scene, stops, best, COMFORT if stays else EMERGENCY, rejected)
 
 
-def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0) -> Candidates:
-    """All motions of a scene, and the rest of the previous plan if the vehicle is where that plan wanted it."""
+def candidates_of(
+    planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0, *, both: bool = False
+) -> Candidates:
+    """All motions of a scene, and the rest of the previous plan if the vehicle is where that plan wanted it.
+
+    both  at speed, too, lateral motions told by the way: those told by time, that go on when the vehicle stands, turn
+          on the spot where it brakes hard"""
     rest = _rest(scene, previous, elapsed)
     ahead = candidates.longitudinal(
         _started(scene.state), scene.goal, planner.fans, planner.weights, None if rest is None else rest[0]
     )
-    across = candidates.lateral(
-        scene.state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
-    )
+    across = _across(planner, scene, None if rest is None else rest[1], both)
     return combined(planner, ahead, across)
+
+
+def _across(planner: Planner, scene: Scene, rest: Lateral | None, both: bool) -> Lateral:
+    """Motions to the offsets; at speed, too, `both` those told by time and by the way."""
+    state, fans = scene.state, planner.fans
+    across = candidates.lateral(state, scene.offsets, scene.wanted, fans, planner.weights, rest)
+    if not both or state.ds < fans.slow:
+        return across
+    pace = state.ds / fans.slow
+    steady = replace(fans, ways=tuple(pace * way for way in fans.ways), slow=math.nextafter(state.ds, math.inf))
+    return candidates.lateral(state, scene.offsets, scene.wanted, steady, planner.weights, across)
 
 
 def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elapsed: float) -> Candidates:
@@ -244,14 +261,7 @@ def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elaps
     duration = np.unique(np.minimum(shortest * np.array([1.0, 1.05, 1.15, 1.4, 1.8, 2.5, 4.0]), longest))
     motion = quartics((state.s, state.ds, state.dds), np.zeros_like(duration), duration)
     ahead = Longitudinal(motion, candidates.longitudinal_cost(motion, Keep(0.0), planner.weights))
-    fans = planner.fans
-    across = candidates.lateral(
-        state, scene.offsets, scene.wanted, fans, planner.weights, None if rest is None else rest[1]
-    )
-    if state.ds >= fans.slow:
-        pace = state.ds / fans.slow
-        steady = replace(fans, ways=tuple(pace * way for way in fans.ways), slow=math.nextafter(state.ds, math.inf))
-        across = candidates.lateral(state, scene.offsets, scene.wanted, steady, planner.weights, across)
+    across = _across(planner, scene._replace(state=state), None if rest is None else rest[1], True)
     return combined(planner, ahead, across)
 
 

@@ -218,6 +218,17 @@ def test_a_stop_point_is_never_passed() -> None:
     assert 70.0 - (state.s + PLANNER.vehicle.front) < 0.15
 
 
+def test_a_stop_within_comfortable_braking_needs_no_more_than_comfort() -> None:
+    """Beside the offset wanted and turned against the line: what is told by time alone turns on the spot there."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        speed, braking = rng.uniform(3.0, 12.0), rng.uniform(0.8, 3.5)
+        state = FrenetState(20.0, speed, rng.uniform(-1.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.05, 0.05))
+        line = state.s + PLANNER.vehicle.front + speed**2 / (2 * braking) + 1.0
+        found = plan(PLANNER, scene(state, stop(line, PLANNER.vehicle.front), stop=line + 0.1, stand=line + 0.1))
+        assert found.tier == COMFORT, (state, braking)
+
+
 def test_a_parked_car_is_passed_beside() -> None:
     state, previous, clearance = START, None, math.inf
     for _ in range(60):

@@ -14,10 +14,10 @@ from numba import njit
 from planning.boundary_kernel import first_line
 from planning.kinematics import GUARDED, MARGINS, PLACED
 from planning.reference_kernel import line_at
-from planning.shapes import CLEARANCE
+from planning.shapes import SIGMAS
 
 margins_of = MARGINS.scalar()
-clearance_of = CLEARANCE.scalar()
+sigmas_of = SIGMAS.scalar()
 placed = PLACED.scalar()
 
 NUM_MARGINS = len(GUARDED)
@@ -33,6 +33,7 @@ REASONS = (
     "other road user",
     "cannot stop beyond the horizon",
 )
+ROUNDING = 1.0 + 1e-9  # of a sum of chances that is just the risk
 CRAWLING = 0.1  # below it the rate of curvature is not looked at: at rest it is free [m/s]
 
 
@@ -144,36 +145,48 @@ def in_plane(a, d, pose):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def first_rectangle(pose, rectangles, middle, circles, radius):  # type: ignore[no-untyped-def]
-    """The first step at which a circle may touch a rectangle, more likely than its chance allows, or K."""
-    first = pose.shape[1]
+def first_rectangle(pose, rectangles, chances, middle, circles, radius):  # type: ignore[no-untyped-def]
+    """The first step at which a circle may touch a rectangle, more likely than the risk, or K. Where no rectangle but
+    their sum is, sum_m p_m Phi(-z_m) with the least z of each, it is the step of the likeliest.
+
+    rectangles (M, 11, K) of planning.shapes.Obstacles.table; chances: risk, and of each rectangle (M,) the probability,
+    the z below which it alone is too much, and the chance that is left where it is not near."""
+    risk, probability, alone, far = chances
+    first, total, likeliest, at = pose.shape[1], 0.0, -1.0, pose.shape[1]
     for m in range(rectangles.shape[0]):
         r, near = rectangles[m], 0
         for k in range(first):  # on vectors: most are far away
             dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
             near += 0 if dx * dx + dy * dy > r[10, k] else 1
         if near == 0:
+            total += far[m]
             continue
+        least, worst = math.inf, first
         for k in range(first):
             dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
             if dx * dx + dy * dy > r[10, k]:
                 continue
-            clear = True
+            z = math.inf
             for n in range(len(circles)):
                 x, y = pose[0, k] + circles[n] * pose[2, k], pose[1, k] + circles[n] * pose[3, k]
-                margin = clearance_of(
-                    x, y, r[0, k], r[1, k], r[2, k], r[3, k], r[4, k], r[5, k], r[6, k], r[7, k], r[8, k], r[9, k],
-                    radius,
-                )  # fmt: skip
-                clear &= margin[0] > 0.0  # NaN is not clear
-            if not clear:
+                told = sigmas_of(
+                    x, y, r[0, k], r[1, k], r[2, k], r[3, k], r[4, k], r[5, k], r[6, k], r[7, k], r[8, k], radius
+                )[0]
+                z = told if not told >= z else z  # NaN is not clear
+            if not z > alone[m]:
                 first = k
                 break
-    return first
+            if z < least:
+                least, worst = z, k
+        chance = max(0.5 * probability[m] * math.erfc(least / math.sqrt(2.0)), far[m])
+        total += chance
+        if chance > likeliest:
+            likeliest, at = chance, worst
+    return min(first, at) if total > risk * ROUNDING else first
 
 
 @njit(error_model="numpy")
-def first_touch(a, pose, end, stop, lines, rectangles, middle, circles, radius):  # type: ignore[no-untyped-def]
+def first_touch(a, pose, end, stop, lines, rectangles, chances, middle, circles, radius):  # type: ignore[no-untyped-def]
     """The first thing that is passed or touched, and its step."""
     num_steps = pose.shape[1]
     found, at = GOOD, num_steps
@@ -185,14 +198,14 @@ def first_touch(a, pose, end, stop, lines, rectangles, middle, circles, radius):
     k = first_line(pose, lines, circles, radius)
     if k < at:
         found, at = BOUNDARY, k
-    k = first_rectangle(pose, rectangles, middle, circles, radius)
+    k = first_rectangle(pose, rectangles, chances, middle, circles, radius)
     return (OBSTACLE, k) if k < at else (found, at)
 
 
 @njit(cache=True, error_model="numpy")
 def judge(  # type: ignore[no-untyped-def]
     order, ahead, across, by_way, bends, ways, start, dt, limits, rate, end, stop, stand, braking,
-    lines, rectangles, middle, circles, radius, first_good, reason, when,
+    lines, rectangles, chances, middle, circles, radius, first_good, reason, when,
 ):  # fmt: skip
     """Fill reason (n m,) and when (n m,), the step at which it arises, of the candidates in `order`; return the first
     good one, or -1. Limits come first, over the whole horizon, then what is touched.
@@ -217,7 +230,7 @@ def judge(  # type: ignore[no-untyped-def]
             found, k = CURVATURE_RATE, first_turn(speed, curvature, start[1], rate * dt)
             if k == num_steps:
                 in_plane(a, d, pose)
-                found, k = first_touch(a, pose, end, stop, lines, rectangles, middle, circles, radius)
+                found, k = first_touch(a, pose, end, stop, lines, rectangles, chances, middle, circles, radius)
                 if found == GOOD and a[0, num_steps - 1] + a[1, num_steps - 1] ** 2 / (2.0 * braking) > stand:
                     found = BEYOND
         reason[c], when[c] = found, k

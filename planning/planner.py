@@ -4,6 +4,9 @@
     relaxed      the same within what the vehicle can do
     emergency    a stop: the cheapest that is clear, else the one that does least harm
 
+A vehicle at rest where it may be stays there, comfortably, if it finds nothing good, even where others may come and
+touch it: `clear` tells.
+
 [K15], section IV-C: horizon 3 s, 20 Hz, every 150 ms; |a_lat| <= 2 m/s^2.
 """
 
@@ -32,6 +35,8 @@ COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
 ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
 ANY = Limits(*(1e9,) * 7)  # no limits but those of geometry
 LARGEST = 1e6  # of what a state or a goal tells: powers of more overflow
+AT_REST = 1e-3  # [m/s] below which a vehicle stands
+FAR = 0.05  # of an equal share of the risk, for road users that a candidate does not come near to
 SLOWEST = 0.05  # [m/s] above which a motion told by time tells a direction
 
 
@@ -135,7 +140,7 @@ class Plan(NamedTuple):
     """A motion from `start` on and how it was come by.
 
     tier       comfort, relaxed, emergency
-    clear      whether it breaks nothing within the horizon (an emergency stop may)
+    clear      whether it breaks nothing within the horizon (an emergency stop may, and others who stands)
     cost       of its candidate
     rejected   {reason: how many cheaper candidates were turned down for it} (planning.check_kernel.REASONS)
     """
@@ -206,9 +211,14 @@ def plan(
     all_reasons        judge every candidate, not only those cheaper than the best: for pictures
 
     Raises InputError for a scene that is not one (shapes, NaN); anything else is answered with a plan."""
+    from planning.check_kernel import GOOD, OBSTACLE
+
     check(planner, scene)
     made = candidates_of(planner, scene, previous, elapsed)
     judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
+    if judged.best < 0 and scene.state.ds >= planner.fans.slow:
+        made = candidates_of(planner, scene, previous, elapsed, both=True)
+        judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
     rejected = turned_down(judged)
     if judged.best >= 0:
         return chosen(scene, judged, judged.best, COMFORT, rejected)
@@ -217,19 +227,34 @@ def plan(
         return chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
     stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able)
     best = stops.best if stops.best >= 0 else least_harm(planner, scene, stops)
-    return chosen(scene, stops, best, EMERGENCY, rejected)
+    stays = abs(scene.state.ds) < AT_REST and stops.reason[best] in (GOOD, OBSTACLE)
+    return chosen(scene, stops, best, COMFORT if stays else EMERGENCY, rejected)
 
 
-def candidates_of(planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0) -> Candidates:
-    """All motions of a scene, and the rest of the previous plan if the vehicle is where that plan wanted it."""
+def candidates_of(
+    planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0, *, both: bool = False
+) -> Candidates:
+    """All motions of a scene, and the rest of the previous plan if the vehicle is where that plan wanted it.
+
+    both  at speed, too, lateral motions told by the way: those told by time, that go on when the vehicle stands, turn
+          on the spot where it brakes hard"""
     rest = _rest(scene, previous, elapsed)
     ahead = candidates.longitudinal(
         _started(scene.state), scene.goal, planner.fans, planner.weights, None if rest is None else rest[0]
     )
-    across = candidates.lateral(
-        scene.state, scene.offsets, scene.wanted, planner.fans, planner.weights, None if rest is None else rest[1]
-    )
+    across = _across(planner, scene, None if rest is None else rest[1], both)
     return combined(planner, ahead, across)
+
+
+def _across(planner: Planner, scene: Scene, rest: Lateral | None, both: bool) -> Lateral:
+    """Motions to the offsets; at speed, too, `both` those told by time and by the way."""
+    state, fans = scene.state, planner.fans
+    across = candidates.lateral(state, scene.offsets, scene.wanted, fans, planner.weights, rest)
+    if not both or state.ds < fans.slow:
+        return across
+    pace = state.ds / fans.slow
+    steady = replace(fans, ways=tuple(pace * way for way in fans.ways), slow=math.nextafter(state.ds, math.inf))
+    return candidates.lateral(state, scene.offsets, scene.wanted, steady, planner.weights, across)
 
 
 def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elapsed: float) -> Candidates:
@@ -245,14 +270,7 @@ def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elaps
     duration = np.unique(np.minimum(shortest * np.array([1.0, 1.05, 1.15, 1.4, 1.8, 2.5, 4.0]), longest))
     motion = quartics((state.s, state.ds, state.dds), np.zeros_like(duration), duration)
     ahead = Longitudinal(motion, candidates.longitudinal_cost(motion, Keep(0.0), planner.weights))
-    fans = planner.fans
-    across = candidates.lateral(
-        state, scene.offsets, scene.wanted, fans, planner.weights, None if rest is None else rest[1]
-    )
-    if state.ds >= fans.slow:
-        pace = state.ds / fans.slow
-        steady = replace(fans, ways=tuple(pace * way for way in fans.ways), slow=math.nextafter(state.ds, math.inf))
-        across = candidates.lateral(state, scene.offsets, scene.wanted, steady, planner.weights, across)
+    across = _across(planner, scene._replace(state=state), None if rest is None else rest[1], True)
     return combined(planner, ahead, across)
 
 
@@ -320,7 +338,7 @@ def _judged(
         scene.stand - vehicle.front,
         limits.braking,
         tuple(scene.boundary[:6]),
-        rectangles(planner, scene),
+        *uncertain(planner, scene),
         vehicle.middle,
         vehicle.circles,
         planner.radius,
@@ -331,12 +349,25 @@ def _judged(
     return best, reason, when
 
 
-def rectangles(planner: Planner, scene: Scene) -> Floats:
-    """The obstacles' table, with the planner's risk shared among them."""
+def rectangles(planner: Planner, scene: Scene, part: float = 1.0) -> Floats:
+    """The obstacles' table, with this part of the planner's risk shared among them in equal shares."""
     vehicle = planner.vehicle
     reach = math.hypot(vehicle.length / 2, vehicle.width / 2) + planner.radius  # generous: circles stand out
-    each = planner.risk / max(len(scene.obstacles.probability), 1)
+    each = part * planner.risk / max(len(scene.obstacles.probability), 1)
     return scene.obstacles.table(each, planner.radius, reach)
+
+
+def uncertain(planner: Planner, scene: Scene) -> tuple[Floats, tuple[float, Floats, Floats, Floats]]:
+    """Rectangles and chances of planning.check_kernel.first_rectangle: each candidate has the whole risk for those that
+    it comes near to, less FAR of an equal share for any other. What is clear with equal shares is so here, too."""
+    from scipy.special import ndtri
+
+    told, chance = rectangles(planner, scene, FAR), scene.obstacles.probability
+    each = FAR * planner.risk / max(len(chance), 1)
+    likely = chance[chance > each]
+    risk = planner.risk - each * (len(chance) - len(likely))
+    alone = -ndtri(np.minimum(risk / likely, 1.0))
+    return told, (risk, likely, alone, np.full(len(likely), each))
 
 
 def turned_down(judged: Candidates) -> dict[str, int]:

@@ -80,6 +80,25 @@ def _clearance(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
 CLEARANCE = Formula("clearance", _clearance, 2, 11)
 
 
+def _sigmas(x: Sequence[Any], p: Sequence[Any], ops: Any) -> tuple[Any, ...]:
+    px, py = x
+    ox, oy, cos, sin, half_length, half_width, along, mixed, across, radius = p
+    ahead, left = (px - ox) * cos + (py - oy) * sin, (py - oy) * cos - (px - ox) * sin
+    qx = ahead - ops.fmin(ops.fmax(ahead, -half_length), half_length)
+    qy = left - ops.fmin(ops.fmax(left, -half_width), half_width)
+    root = ops.sqrt(qx * qx + qy * qy)
+    spread = ops.fmax(qx * qx * along + 2 * qx * qy * mixed + qy * qy * across, 0.0)
+    towards = ops.fmax(ops.sqrt(spread) / ops.fmax(root, EXACT), EXACT)
+    beside = (ops.fabs(left) - half_width - radius) / ops.fmax(ops.sqrt(ops.fmax(across, 0.0)), EXACT)
+    beyond = (ops.fabs(ahead) - half_length - radius) / ops.fmax(ops.sqrt(ops.fmax(along, 0.0)), EXACT)
+    return (ops.fmax((root - radius) / towards, ops.fmax(beside, beyond)),)
+
+
+# the largest z with which CLEARANCE is not negative: P(touch) <= Phi(-z) of a circle at x; places are known to EXACT
+EXACT = 1e-9  # [m]
+SIGMAS = Formula("sigmas", _sigmas, 2, 10)
+
+
 ROUND = 6  # the exponent of the smooth outline: at 6 a car with circles of 1.35 m grows by 3 cm at its sides
 BEARINGS = 64  # of half a circle, at which it is fitted
 FITTED = 1.003  # what it is widened by, for the bearings between

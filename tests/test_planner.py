@@ -16,7 +16,7 @@ from planning.kinematics import KINEMATICS, LIMITS, MARGINS, Limits
 from planning.planner import COMFORT, EMERGENCY, RELAXED, Plan, Planner, Scene, candidates_of, judge, judge_states, plan
 from planning.polynomials import NOTHING, Polynomials
 from planning.reference import from_curvature
-from planning.shapes import CLEARANCE, Obstacles, Vehicle, boundary, no_obstacles
+from planning.shapes import CLEARANCE, SIGMAS, Obstacles, Vehicle, boundary, no_obstacles
 
 PLANNER = Planner()
 S = np.arange(0.0, 301.0, 0.5)
@@ -131,7 +131,8 @@ def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) ->
     import shapely
 
     lines = shapely.multilinestrings([shapely.linestrings(part.reshape(2, 2)) for part in given.boundary.segment])
-    rectangles = given.obstacles.table(planner.risk / max(len(given.obstacles.pose), 1), radius, 10.0)
+    rectangles = given.obstacles.table(1e-12, radius, 10.0)
+    chance = np.zeros((len(rectangles), planner.num_steps))
     from planning.frenet import to_pose
 
     if (margins[:, :10] < 0).any():
@@ -148,9 +149,13 @@ def brute(planner: Planner, given: Scene, found: Any, c: int, limits: Limits) ->
         centres = xy[k] + vehicle.circles[:, None] * [np.cos(heading[k]), np.sin(heading[k])]
         if (shapely.distance(shapely.points(centres), lines) <= radius).any():
             return "boundary line"
-        for r in rectangles[..., k]:
-            if (CLEARANCE(centres, np.array([[*r[:10], radius]])) <= 0).any():
-                return "other road user"
+        for m, r in enumerate(rectangles[..., k]):
+            z = float(SIGMAS(centres, np.array([[*r[:9], radius]])).min())
+            chance[m, k] = given.obstacles.probability[m] * 0.5 * math.erfc(z / math.sqrt(2))
+        if (chance[:, k] > planner.risk).any():
+            return "other road user"
+    if chance.max(1, initial=0.0).sum() > planner.risk:
+        return "other road user"
     if s[-1] + ds[-1] ** 2 / (2 * limits.braking) > given.stand - vehicle.front:
         return "cannot stop beyond the horizon"
     return "none"
@@ -213,6 +218,17 @@ def test_a_stop_point_is_never_passed() -> None:
     assert 70.0 - (state.s + PLANNER.vehicle.front) < 0.15
 
 
+def test_a_stop_within_comfortable_braking_needs_no_more_than_comfort() -> None:
+    """Beside the offset wanted and turned against the line: what is told by time alone turns on the spot there."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        speed, braking = rng.uniform(3.0, 12.0), rng.uniform(0.8, 3.5)
+        state = FrenetState(20.0, speed, rng.uniform(-1.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.05, 0.05))
+        line = state.s + PLANNER.vehicle.front + speed**2 / (2 * braking) + 1.0
+        found = plan(PLANNER, scene(state, stop(line, PLANNER.vehicle.front), stop=line + 0.1, stand=line + 0.1))
+        assert found.tier == COMFORT, (state, braking)
+
+
 def test_a_parked_car_is_passed_beside() -> None:
     state, previous, clearance = START, None, math.inf
     for _ in range(60):
@@ -248,6 +264,18 @@ def test_where_comfort_does_not_do_what_the_vehicle_can_is_used() -> None:
 def test_a_standing_vehicle_starts() -> None:
     found = plan(PLANNER, scene(FrenetState(20.0, 0.0, 0.0, 0.4, 0.1), Keep(8.0)))
     assert found.tier == COMFORT and found.states([3.0])[0].ds > 3.0
+
+
+def test_who_stands_stays_without_an_emergency_whoever_comes() -> None:
+    """Somebody drives at it from ahead, another stands behind: nothing is clear, and there is nothing to brake for."""
+    given = scene(FrenetState(20.0, 0.0, 0.0, 0.0), Keep(8.0), obstacles=rectangle(32.0, 0.0, -6.0))
+    found = plan(PLANNER, given)
+    assert (found.tier, found.clear) == (COMFORT, False) and found.rejected["other road user"] > 0
+    assert found.along(np.arange(0.0, 3.0, 0.05))[:, 0].max() == pytest.approx(20.0, abs=1e-9)
+    on_a_kerb = boundary([LINE.place([18.0, 24.0], 0.5)], PLANNER.radius)
+    assert plan(PLANNER, given._replace(boundary=on_a_kerb)).tier == EMERGENCY, "it may not be where it is"
+    moving = plan(PLANNER, given._replace(state=FrenetState(20.0, 0.5, 0.0, 0.0)))
+    assert (moving.tier, moving.clear) == (EMERGENCY, False)
 
 
 def test_unlikely_and_uncertain_road_users() -> None:

@@ -17,6 +17,7 @@ from planning.check_kernel import first_rectangle
 from planning.shapes import CLEARANCE, OUTLINE, ROUND, Boundary, Obstacles, Vehicle, boundary, outlines
 
 VEHICLE = Vehicle()
+CERTAIN = (1e-3, np.ones(1), np.full(1, 3.0902), np.zeros(1))  # one rectangle that must not be touched
 
 
 def rectangle(x: float, y: float, heading: float, length: float, width: float) -> shapely.Polygon:
@@ -86,9 +87,9 @@ def test_a_place_uncertain_in_one_direction_only_is_met_beside_it_as_if_it_were_
         margin = margins(row, np.stack([1.9 * left, 2.1 * left]), 1.0)
         assert margin[0] < 0 < margin[1]
         pose = np.array([[1.9 * left[0]], [1.9 * left[1]], [1.0], [0.0]])
-        assert first_rectangle(pose, row[None, :, None], 0.0, np.zeros(1), 1.0) == 0
+        assert first_rectangle(pose, row[None, :, None], CERTAIN, 0.0, np.zeros(1), 1.0) == 0
         row[6] = math.nan
-        assert first_rectangle(pose * 1.2, row[None, :, None], 0.0, np.zeros(1), 1.0) == 0, "NaN is not clear"
+        assert first_rectangle(pose * 1.2, row[None, :, None], CERTAIN, 0.0, np.zeros(1), 1.0) == 0, "NaN is not clear"
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -32,6 +32,8 @@ from planning.shapes import Boundary, Obstacles, Vehicle, check_obstacles
 
 Floats = NDArray[np.float64]
 COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
+# from powers of t / T to Bernstein's basis: a polynomial on [0, T] lies between its least and largest coefficient there
+BERNSTEIN = np.array([[math.comb(i, k) / math.comb(4, k) for k in range(5)] for i in range(5)])
 ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
 ANY = Limits(*(1e9,) * 7)  # no limits but those of geometry
 LARGEST = 1e6  # of what a state or a goal tells: powers of more overflow
@@ -158,7 +160,10 @@ class Plan(NamedTuple):
     def along(self, t: Floats) -> Floats:
         """s, s', s'' (K, 3), never backwards: it stands where the motion turns, until that is back."""
         told = self.longitudinal.at(t)[0]
-        speed = np.polynomial.Polynomial(self.longitudinal.coefficients[0]).deriv()
+        rate = self.longitudinal.coefficients[0, 1:] * np.arange(1.0, 6.0)  # of the speed's powers
+        if (BERNSTEIN @ (rate * self.longitudinal.duration[0] ** np.arange(5.0)) > ON_PLAN).all():  # it never turns
+            return told
+        speed = np.polynomial.Polynomial(rate)
         roots = np.asarray(speed.roots(), complex)
         turns: Floats = np.sort(roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real)
         turns = np.r_[0.0, turns[(turns > 0.0) & (turns < self.longitudinal.duration[0])]]

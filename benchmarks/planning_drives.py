@@ -76,6 +76,7 @@ def closed_loops(effort: Effort) -> Values:
         "stop_error_m": largest("stop_error_m"),
         "gap_error_m": largest("gap_error_m"),
         "emergency_share": Value(float(emergency), f"of {sum(cycles):g} cycles"),
+        "unclear_share": Value(float(np.average([one["unclear"] for one in found.values()], weights=cycles))),
         "cycle_ms": Value(float(ms), "median over drives of the median over cycles"),
     }
 
@@ -106,6 +107,7 @@ MEASUREMENTS = (
                 at_most=0.3,
             ),
             Figure("emergency_share", "", "share of cycles that ended in an emergency stop"),
+            Figure("unclear_share", "", "share of cycles whose plan may touch something, standing ones included"),
             Figure("cycle_ms", "ms", "wall time of a cycle from tracks to plan", "cycles of 150 ms"),
         ),
         closed_loops,

@@ -19,6 +19,7 @@
     comfort                share of cycles with a plan within comfortable limits
     relaxed                share with one within what the vehicle can
     emergency              share of emergency stops
+    unclear                share of cycles whose plan may touch something or pass a line, standing ones included
     refined                share of cycles that follow a motion refined by optimal control
     cost_mean              of what is followed, without stops of cycles that could not be planned
     plan_cost_mean         of the plans before refinement, in the same cycles
@@ -86,6 +87,7 @@ def metrics(drive: Drive, *, gap: float = 4.0, headway: float = 1.2) -> dict[str
     planned = np.isfinite(log.plan_cost)
     out["refined"] = float(log.refined.mean())
     out |= {f"{name}_mean": float(getattr(log, name)[planned].mean()) for name in ("cost", "plan_cost")}
+    out["unclear"] = float((~log.clear).mean())
     out["stated"] = float((log.stated != "").sum())
     later = log.ms[1:] if len(log.ms) > 1 else log.ms
     return out | {"cycle_median_ms": float(np.median(later)), "cycle_p99_ms": float(np.quantile(later, 0.99))}

@@ -112,6 +112,8 @@ def test_the_box_is_an_emergency_that_ends_before_the_wall(driven: dict[str, Dri
     log = driven["box"].log
     assert log.tier[0] == EMERGENCY and driven["box"].plans[0].rejected
     assert log.ego[-1, 3] < 1e-3 and 0.0 < metrics(driven["box"])["boundary_clearance_m"]
+    unclear = [metrics(driven["box"]._replace(log=log._replace(clear=np.arange(len(log.clear)) >= n))) for n in (0, 2)]
+    assert [found["unclear"] for found in unclear] == [0.0, pytest.approx(2 / len(log.clear))]
 
 
 def test_a_world_that_does_not_change_is_planned_as_before() -> None:

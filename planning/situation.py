@@ -106,7 +106,8 @@ class Relations(NamedTuple):
 
     lanes        (L,) ids
     probability  (M, L + 1) that a track is on each, and, last, on none
-    s, d, slope  (M, L) arc length, offset, and tan of the direction against the lane; 0 where it is far away
+    s, d, slope  (M, L) arc length (below 0, or above the length, before and after the lane), offset, and tan of the
+                 direction against the lane; 0 where it is far away
     """
 
     lanes: Ints
@@ -139,6 +140,7 @@ def relations(roads: Network, tracks: Tracks, settings: Situation = Situation())
     left = np.stack([-np.sin(theta), np.cos(theta)], -1)
     off = tracks.position[row] - told[:, 2:4]
     ahead = off[:, 0] * left[:, 1] - off[:, 1] * left[:, 0]
+    s = s + np.where(ended == BEYOND_ENDS, ahead, 0.0)
     on = (ended == FOUND) | ((ended == BEYOND_ENDS) & (np.abs(ahead) < JOINT))
     std = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", left, tracks.covariance[row], left), 1e-6))
     turned = np.remainder(tracks.heading[row] - theta + math.pi, 2 * math.pi) - math.pi
@@ -285,24 +287,24 @@ def _branches(roads: Network, lane: int, reach: float) -> Iterator[tuple[tuple[i
 
 
 def _along_lanes(roads: Network, found: list[_Hypothesis], way: Floats, pose: Floats) -> None:
-    """Fill pose (M, T, 3) of hypotheses along lanes, lane by lane; beyond the last lane they go straight on."""
-    pieces: dict[int, list[tuple[int, float, float]]] = {}
+    """Fill pose (M, T, 3) of hypotheses along lanes, lane by lane; beyond the ends of the first and last: straight."""
+    pieces: dict[int, list[tuple[int, float, float, float]]] = {}
     for m, h in enumerate(found):
-        begin = -h.s
+        zero = -h.s
         for n, a in enumerate(h.lanes):
-            end = begin + roads.lines[a].length if n + 1 < len(h.lanes) else math.inf
-            pieces.setdefault(a, []).append((m, begin, end))
-            begin = end
+            begin, end = zero if n else -math.inf, zero + roads.lines[a].length
+            pieces.setdefault(a, []).append((m, zero, begin, end if n + 1 < len(h.lanes) else math.inf))
+            zero = end
     start = np.array([(h.d, h.slope, h.back) for h in found])
     for a, told in pieces.items():
-        line, which = roads.lines[a], np.array([m for m, _, _ in told])
-        begins, ends = np.array([[b, e] for _, b, e in told]).T[..., None]
+        line, which = roads.lines[a], np.array([m for m, *_ in told])
+        zeros, begins, ends = np.array([part for _, *part in told]).T[..., None]
         piece, k = np.nonzero((way[which] >= begins) & (way[which] < ends))
         row = which[piece]
         w, (d0, slope, back) = way[row, k], start[row].T
-        s = w - begins[piece, 0]
-        on = line.at(np.minimum(s, line.length))
-        over = np.maximum(s - line.length, 0.0)
+        s = w - zeros[piece, 0]
+        on = line.at(np.clip(s, 0.0, line.length))
+        over = s - np.clip(s, 0.0, line.length)
         fade, pull = np.exp(-w / back), slope + d0 / back
         d, rate = (d0 + pull * w) * fade, (pull - (d0 + pull * w) / back) * fade
         cos, sin = np.cos(on[:, 2]), np.sin(on[:, 2])

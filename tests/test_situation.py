@@ -72,8 +72,18 @@ def test_probabilities_sum_to_one_and_hypotheses_to_existence(
     assert relations(roads, told).probability.sum() == pytest.approx(1.0)
     found = predict(roads, told, TIMES)
     assert found.probability.sum() == pytest.approx(existence)
-    np.testing.assert_allclose(found.pose[:, 0, :2], [[x, y]] * len(found.pose), atol=0.06)
+    np.testing.assert_allclose(found.pose[:, 0, :2], [[x, y]] * len(found.pose), atol=1e-6)
     assert np.linalg.eigvalsh(found.obstacles.covariance).min() > -1e-9
+
+
+@pytest.mark.parametrize("x", [-0.25, 90.2, 250.25])
+def test_before_and_after_a_lane_tracks_are_where_they_are(x: float) -> None:
+    """Lane 1 begins at 0 and leads to lane 2 at 90, which ends at 250."""
+    found = predict(network(crossing()), tracks([User(x, 0.4, 0.0, 8.0)]), TIMES)
+    assert (found.lane != NO_LANE).any()
+    expected = np.broadcast_to(x + 8.0 * found.times, found.pose.shape[:2])
+    np.testing.assert_allclose(found.pose[..., 0], expected, atol=1e-6)
+    np.testing.assert_allclose(found.pose[:, 0, 1], 0.4, atol=1e-6)
 
 
 def test_a_track_keeps_its_lane_and_its_speed() -> None:

@@ -198,7 +198,7 @@ GIVE_WAY = StopPoint("give way", "yield", 95.0, 105.0, CROSSING_ZONE)
 ZEBRA = StopPoint("zebra", "crosswalk", 140.0, 144.0, np.array([[140, -4.0], [144, -4.0], [144, 4.0], [140, 4.0]]))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     s=st.floats(2.0, 40.0), speed=st.floats(0.0, 12.0), acceleration=st.floats(-1.0, 1.0), d=st.floats(-0.35, 0.35),
     green=st.floats(0.0, 9.0), cars=st.lists(st.floats(-150.0, -20.0), max_size=3), walks=st.floats(-25.0, 25.0),

@@ -25,7 +25,7 @@ def winding(amplitude: float, period: float) -> ReferenceLine:
 LINE = winding(0.05, 9.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     amplitude=st.floats(0.0, 0.12),
     period=st.floats(6.0, 40.0),

@@ -37,7 +37,7 @@ def margins(r: np.ndarray, centres: np.ndarray, radius: float) -> np.ndarray:
     return CLEARANCE(centres, np.array([[*r[:10], radius]]))[:, 0]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     x=st.floats(-6, 6), y=st.floats(-6, 6), heading=st.floats(-4, 4), length=st.floats(0.5, 8), width=st.floats(0.5, 3)
 )  # fmt: skip
@@ -180,7 +180,7 @@ def test_lines_that_are_none_are_refused(line: np.ndarray) -> None:
         boundary([line], 1.0)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     length=st.floats(0.3, 15), width=st.floats(0.3, 4), radius=st.floats(0.5, 2.0), std=st.floats(0, 2),
     ratio=st.floats(0, 1), turn=st.floats(-4, 4), seed=st.integers(0, 1000),

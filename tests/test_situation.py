@@ -59,7 +59,7 @@ def test_pedestrians_and_who_drives_backwards_are_on_no_lane() -> None:
     assert chances(User(100.0, 0.0, speed=-1.0))[2] == 1.0
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     x=st.floats(-20, 270), y=st.floats(-130, 130), heading=st.floats(-7, 7), speed=st.floats(-2, 20),
     std=st.floats(0.01, 3.0), existence=st.floats(0.0, 1.0),

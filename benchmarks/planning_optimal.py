@@ -15,8 +15,9 @@ from inference.progress import Progress
 from planning.candidates import Goal, Keep, follow, stop
 from planning.frenet import FrenetState
 from planning.optimal import DEARER, Refined, refine
-from planning.planner import COMFORT, Planner, Scene, plan
+from planning.planner import COMFORT, Planner, plan
 from planning.reference import ReferenceLine, from_curvature
+from planning.scene import Scene
 from planning.shapes import Obstacles, boundary
 
 LARGEST = 3  # number of other road users

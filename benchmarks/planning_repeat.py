@@ -11,7 +11,9 @@ from benchmarks.figure import Figure, Measurement, Value, Values
 from benchmarks.planning_scene import LINE, PLANNER, Effort
 from planning.candidates import Goal, Keep, follow, merge, stop
 from planning.frenet import FrenetState
-from planning.planner import Plan, Planner, Scene, plan
+from planning.planner import Planner, plan
+from planning.plans import Plan
+from planning.scene import Scene
 from planning.shapes import CLEARANCE, Obstacles, boundary, no_obstacles
 
 Floats = NDArray[np.float64]

@@ -10,9 +10,11 @@ import numpy as np
 from planning.candidates import Keep, Lateral, Longitudinal, Weights, longitudinal_cost
 from planning.frenet import FrenetState
 from planning.kinematics import Limits
-from planning.planner import Candidates, Planner, Scene, combined
+from planning.planner import Planner, combined
+from planning.plans import Candidates
 from planning.polynomials import quartics, quintics, squared_jerk
 from planning.reference import from_curvature
+from planning.scene import Scene
 from planning.shapes import Obstacles, boundary
 
 S = np.arange(0.0, 301.0, 0.5)

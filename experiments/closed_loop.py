@@ -26,11 +26,12 @@ from models.program import InputError
 from planning.control import Command, Control, Lags, command, moved
 from planning.frenet import FrenetState, Pose, to_frenet, to_pose
 from planning.optimal import refine
-from planning.planner import EMERGENCY, Plan, Planner, plan
-from planning.planner import Scene as PlanScene
+from planning.planner import EMERGENCY, Planner, plan
+from planning.plans import Plan
 from planning.polynomials import quartics, quintics
 from planning.refined import Refined
 from planning.road import Route, Tracks, route
+from planning.scene import Scene as PlanScene
 from planning.shapes import Vehicle
 
 Floats = NDArray[np.float64]

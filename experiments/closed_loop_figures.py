@@ -17,7 +17,8 @@ from experiments.closed_loop import Drive
 from experiments.closed_loop_metrics import arc_lengths, limits_driven, outlines
 from experiments.tracking_animation import CIRCLE, ELLIPSE
 from planning.check_kernel import REASONS
-from planning.planner import COMFORT, EMERGENCY, RELAXED, Candidates, candidates_of, judge, plan
+from planning.planner import COMFORT, EMERGENCY, RELAXED, candidates_of, judge, plan
+from planning.plans import Candidates
 
 Floats = NDArray[np.float64]
 INK, FAINT, KERB, ROUTE = "#1d2430", "#c9ced6", "#5b3f8c", "#8a8f98"

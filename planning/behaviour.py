@@ -23,10 +23,11 @@ from planning.decision import PAST, Permissions
 from planning.frenet import FrenetState, to_pose
 from planning.gaps import ALIGNED, Gap, Gaps, merging, movers_of
 from planning.leads import Lead, lead_of
-from planning.planner import Planner, Scene
+from planning.planner import Planner
 from planning.release import LEFT, RIGHT, Passing, Release, extent, passing
 from planning.relief import eased, needed
 from planning.road import EDGE, Floats, Route, StopPoint
+from planning.scene import Scene
 from planning.shapes import Boundary, Obstacles, boundary
 from planning.situation import Along, Predictions, along
 from planning.speeds import speed_ahead, speed_before

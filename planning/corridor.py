@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.planner import Plan, Planner, Scene
+from planning.planner import Planner
+from planning.plans import Plan
 from planning.reference_kernel import FOUND
+from planning.scene import Scene
 
 Floats = NDArray[np.float64]
 APART = 1.0  # of the points of a segment that are looked at [m]

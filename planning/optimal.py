@@ -28,18 +28,18 @@ from planning.planner import (
     EMERGENCY,
     ON_PLAN,
     RELAXED,
-    Plan,
     Planner,
-    Scene,
     candidates_of,
     chosen,
     judge,
     judge_states,
     rectangles,
 )
+from planning.plans import Plan
 from planning.polynomials import NOTHING
 from planning.reference import ReferenceLine
 from planning.refined import Motion, Refined, motions, moved
+from planning.scene import Scene
 from planning.shapes import OUTLINE, outlines
 
 Floats = NDArray[np.float64]

@@ -14,32 +14,27 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.program import InputError
 from planning import candidates
-from planning.candidates import Fans, Goal, Keep, Lateral, Longitudinal, Reach, Weights
-from planning.frenet import FrenetState, to_pose, to_poses
+from planning.candidates import Fans, Keep, Lateral, Longitudinal, Weights
+from planning.frenet import FrenetState, to_pose
 from planning.kinematics import LIMITS, Limits
+from planning.plans import SLOWEST, Candidates, Plan
 from planning.polynomials import Polynomials, quartics
-from planning.reference import ReferenceLine
-from planning.shapes import Boundary, Obstacles, Vehicle, check_obstacles
+from planning.scene import Scene, check
+from planning.shapes import Vehicle
 
 Floats = NDArray[np.float64]
 COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
-# from powers of t / T to Bernstein's basis: a polynomial on [0, T] lies between its least and largest coefficient there
-BERNSTEIN = np.array([[math.comb(i, k) / math.comb(4, k) for k in range(5)] for i in range(5)])
 ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
 ANY = Limits(*(1e9,) * 7)  # no limits but those of geometry
-LARGEST = 1e6  # of what a state or a goal tells: powers of more overflow
 AT_REST = 1e-3  # [m/s] below which a vehicle stands
 FAR = 0.05  # of an equal share of the risk, for road users that a candidate does not come near to
-SLOWEST = 0.05  # [m/s] above which a motion told by time tells a direction
 
 
 @dataclass(frozen=True)
@@ -93,120 +88,6 @@ class Planner:
         return self.vehicle.radius + self.margin
 
 
-class Scene(NamedTuple):
-    """What a cycle plans in.
-
-    line      the reference line; state along it
-    goal      along the line
-    offsets   (N,) targets of the offset, and the one wanted [m]
-    boundary  lines not to touch (planning.shapes.boundary, with the planner's radius)
-    obstacles predicted at the horizon's steps
-    stop      arc length that the vehicle's front must not pass, e.g. a line without permission [m]
-    stand     arc length before which the front must be able to stand after the horizon [m]
-    """
-
-    line: ReferenceLine
-    state: FrenetState
-    goal: Goal
-    offsets: Floats
-    wanted: float
-    boundary: Boundary
-    obstacles: Obstacles
-    stop: float = math.inf
-    stand: float = math.inf
-
-
-PARTS: dict[str, tuple[type, ...]] = {
-    "line": (ReferenceLine,),
-    "state": (FrenetState,),
-    "goal": (Keep, Reach),
-    "boundary": (Boundary,),
-    "obstacles": (Obstacles,),
-}
-
-
-class Candidates(NamedTuple):
-    """All n x m of them, cheapest first in `order`; `reason` each is bad for (planning.check_kernel.REASONS), -1 where
-    none was asked for; `when` it arises [steps]; `best` the cheapest good one, or -1."""
-
-    longitudinal: Longitudinal
-    lateral: Lateral
-    cost: Floats
-    order: NDArray[np.int64]
-    reason: NDArray[np.int64]
-    when: NDArray[np.int64]
-    best: int
-
-
-class Plan(NamedTuple):
-    """A motion from `start` on and how it was come by.
-
-    tier       comfort, relaxed, emergency
-    clear      whether it breaks nothing within the horizon (an emergency stop may, and others who stands)
-    cost       of its candidate
-    rejected   {reason: how many cheaper candidates were turned down for it} (planning.check_kernel.REASONS)
-    """
-
-    line: ReferenceLine
-    start: FrenetState
-    longitudinal: Polynomials
-    lateral: Lateral
-    tier: str
-    clear: bool
-    cost: float
-    rejected: dict[str, int]
-    candidates: Candidates
-
-    def along(self, t: Floats) -> Floats:
-        """s, s', s'' (K, 3), never backwards: it stands where the motion turns, until that is back."""
-        told = self.longitudinal.at(t)[0]
-        rate = self.longitudinal.coefficients[0, 1:] * np.arange(1.0, 6.0)  # of the speed's powers
-        if (BERNSTEIN @ (rate * self.longitudinal.duration[0] ** np.arange(5.0)) > ON_PLAN).all():  # it never turns
-            return told
-        speed = np.polynomial.Polynomial(rate)
-        roots = np.asarray(speed.roots(), complex)
-        turns: Floats = np.sort(roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real)
-        turns = np.r_[0.0, turns[(turns > 0.0) & (turns < self.longitudinal.duration[0])]]
-        farthest = np.maximum.accumulate(self.longitudinal.at(turns)[0, :, 0])
-        farthest = farthest[np.searchsorted(turns, t, side="right") - 1]
-        still = (told[:, 1] < 0.0) | (farthest > told[:, 0])
-        told[still, 0] = np.maximum(farthest, told[:, 0])[still]
-        told[still, 1:] = 0.0
-        return told
-
-    def states(self, t: Sequence[float] | Floats) -> list[FrenetState]:
-        """Where the vehicle is along the line at times t after the start."""
-        along = self.along(np.asarray(t, float))
-        if self.lateral.by_way[0]:
-            across = self.lateral.motion.at(along[:, 0] - self.start.s)[0]
-            return [FrenetState(*map(float, (*a, *d))) for a, d in zip(along, across, strict=True)]
-        across = self.lateral.motion.at(np.asarray(t, float))[0]
-        return [state_of(a, d) for a, d in zip(along, across, strict=True)]
-
-    def trajectory(self, t: Sequence[float] | Floats) -> Floats:
-        """x, y, heading, speed, acceleration, curvature (K, 6) at times t after the start."""
-        return to_poses(self.line, self.states(t))
-
-
-def forwards(along: Floats) -> Floats:
-    """s, s', s'' (K, 3) at rising times, standing where they would go back."""
-    told = along.copy()
-    still = (told[:, 1] < 0.0) | (np.maximum.accumulate(told[:, 0]) > told[:, 0])
-    told[:, 0] = np.maximum.accumulate(told[:, 0])
-    told[still, 1:] = 0.0
-    return told
-
-
-def state_of(along: Floats, across: Floats) -> FrenetState:
-    """The state of s, s', s'' and d, d', d'' in time; at rest the line's direction."""
-    s, ds, dds = map(float, along)
-    d, dd, ddd = map(float, across)
-    if ds < SLOWEST:
-        return FrenetState(s, ds, dds, d)
-    slope = dd / ds
-    return FrenetState(s, ds, dds, d, slope, (ddd - slope * dds) / ds**2)
-
-
 def plan(
     planner: Planner, scene: Scene, previous: Plan | None = None, elapsed: float = 0.0, *, all_reasons: bool = False
 ) -> Plan:
@@ -218,7 +99,7 @@ def plan(
     Raises InputError for a scene that is not one (shapes, NaN); anything else is answered with a plan."""
     from planning.check_kernel import GOOD, OBSTACLE
 
-    check(planner, scene)
+    check(scene, planner.radius, planner.num_steps)
     made = candidates_of(planner, scene, previous, elapsed)
     judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
     if judged.best < 0 and scene.state.ds >= planner.fans.slow:
@@ -382,46 +263,6 @@ def turned_down(judged: Candidates) -> dict[str, int]:
     rank = np.flatnonzero(judged.order == judged.best)
     cheaper = judged.order[: rank[0]] if len(rank) else judged.order
     return dict(Counter(REASONS[reason] for reason in judged.reason[cheaper]).most_common())
-
-
-def check(planner: Planner, scene: Scene) -> None:
-    """Raises InputError for a scene that no plan can be made for, in words."""
-    for name, kinds in PARTS.items():
-        if not isinstance(part := getattr(scene, name), kinds):
-            words = " or ".join(kind.__name__ for kind in kinds)
-            raise InputError(f"scene: {name} is of type {type(part).__name__}, but must be {words}")
-    for name, value in zip(scene.state._fields, scene.state, strict=True):
-        if not abs(value) < LARGEST:
-            raise InputError(f"the vehicle's state has {name} = {value}")
-    if not 0.0 <= scene.state.s <= scene.line.length:
-        raise InputError(
-            f"the vehicle is at s {scene.state.s:.1f} m of a line from 0 to {scene.line.length:.1f} m; "
-            "choose a longer one"
-        )
-    for name, value in zip(scene.goal._fields, scene.goal, strict=True):
-        if not (abs(value) < LARGEST or (name == "until" and value == math.inf)):
-            raise InputError(f"the goal {scene.goal} is not finite, or out of this world")
-    if scene.goal.speed < 0.0:
-        raise InputError(f"the goal {scene.goal} has a negative speed; 0 stands still")
-    if (
-        np.ndim(scene.offsets) != 1
-        or not len(scene.offsets)
-        or not np.isfinite(scene.offsets).all()
-        or not math.isfinite(scene.wanted)
-    ):
-        raise InputError(
-            f"offsets to drive to are {np.asarray(scene.offsets).tolist()}, but must be one or more numbers"
-        )
-    if scene.boundary.reach < planner.radius:
-        raise InputError(
-            f"boundary lines are known to {scene.boundary.reach:.2f} m, but the vehicle's circles reach "
-            f"{planner.radius:.2f} m; build them with that reach"
-        )
-    for name in ("stop", "stand"):
-        value = getattr(scene, name)
-        if value is None or math.isnan(value):
-            raise InputError(f"scene: {name} is {value}; infinity means none")
-    check_obstacles(scene.obstacles, planner.num_steps)
 
 
 def _rest(scene: Scene, previous: Plan | None, elapsed: float) -> tuple[Polynomials, Lateral] | None:

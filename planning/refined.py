@@ -12,7 +12,8 @@ from planning import optimal_problem as problem
 from planning.candidates import Weights
 from planning.frenet import FrenetState, to_poses
 from planning.optimal_problem import ACROSS, TO_PLACE, TO_SPEED, Shape
-from planning.planner import COMFORT, Plan, forwards, state_of
+from planning.planner import COMFORT
+from planning.plans import Plan, forwards, state_of
 from planning.polynomials import Polynomials, quartics, quintics, squared_jerk
 
 Floats = NDArray[np.float64]

@@ -11,8 +11,10 @@ import numpy as np
 from planning.behaviour import Manners, Memory, behave
 from planning.decision import Decided, Light, Permissions, Rules, decide
 from planning.frenet import FrenetState
-from planning.planner import Plan, Planner, Scene, plan
+from planning.planner import Planner, plan
+from planning.plans import Plan
 from planning.road import Floats, Lane, Route, StopPoint, Tracks, no_tracks
+from planning.scene import Scene
 from planning.situation import Network, Predictions, along, predict
 
 PLANNER = Planner()

@@ -27,9 +27,10 @@ from planning.check_kernel import (
 )
 from planning.frenet import FrenetState, to_pose
 from planning.kinematics import GUARDED, KINEMATICS, LIMITS, MARGINS, Limits
-from planning.planner import Planner, Scene, combined, judge
+from planning.planner import Planner, combined, judge
 from planning.polynomials import NOTHING, Polynomials, quartics, quintics
 from planning.reference import from_curvature
+from planning.scene import Scene
 from planning.shapes import Obstacles, boundary, no_obstacles
 
 PLANNER = Planner()

@@ -22,9 +22,9 @@ from planning.candidates import Fans, Keep
 from planning.control import Control
 from planning.frenet import FrenetState, Pose
 from planning.planner import COMFORT, EMERGENCY, Planner, plan
-from planning.planner import Scene as PlanScene
 from planning.reference import from_curvature
 from planning.road import Route, Tracks
+from planning.scene import Scene as PlanScene
 from planning.shapes import boundary, no_obstacles
 from tests.conftest import Command
 

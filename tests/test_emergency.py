@@ -11,9 +11,11 @@ import pytest
 from planning.candidates import Goal, Keep, stop
 from planning.check_kernel import REASONS
 from planning.frenet import FrenetState
-from planning.planner import AT_REST, COMFORT, EMERGENCY, RELAXED, Plan, Planner, Scene, emergency_stops, plan
+from planning.planner import AT_REST, COMFORT, EMERGENCY, RELAXED, Planner, emergency_stops, plan
+from planning.plans import Plan
 from planning.polynomials import quintics
 from planning.reference import from_curvature
+from planning.scene import Scene
 from planning.shapes import Obstacles, boundary, no_obstacles
 
 PLANNER = Planner()

@@ -18,9 +18,10 @@ from planning.frenet import FrenetState
 from planning.kinematics import Limits
 from planning.optimal import refine
 from planning.optimal_problem import ACROSS, TO_PLACE, TO_SPEED
-from planning.planner import COMFORT, EMERGENCY, Planner, Scene, plan
+from planning.planner import COMFORT, EMERGENCY, Planner, plan
 from planning.polynomials import quartics, quintics, squared_jerk
 from planning.reference import from_curvature
+from planning.scene import Scene
 from planning.shapes import Obstacles, boundary, no_obstacles
 
 PLANNER = Planner()

@@ -13,9 +13,11 @@ from planning.candidates import Goal, Keep, Reach, follow, merge, stop
 from planning.check_kernel import REASONS
 from planning.frenet import FrenetState, Pose
 from planning.kinematics import KINEMATICS, LIMITS, MARGINS, Limits
-from planning.planner import COMFORT, EMERGENCY, RELAXED, Plan, Planner, Scene, candidates_of, judge, judge_states, plan
+from planning.planner import COMFORT, EMERGENCY, RELAXED, Planner, candidates_of, judge, judge_states, plan
+from planning.plans import Plan
 from planning.polynomials import NOTHING, Polynomials
 from planning.reference import from_curvature
+from planning.scene import Scene
 from planning.shapes import CLEARANCE, SIGMAS, Obstacles, Vehicle, boundary, no_obstacles
 
 PLANNER = Planner()

@@ -11,9 +11,10 @@ from planning.behaviour import behave
 from planning.candidates import Keep
 from planning.decision import Decided, Permissions
 from planning.frenet import FrenetState
-from planning.planner import COMFORT, EMERGENCY, Scene, emergency_stops, judge, plan
+from planning.planner import COMFORT, EMERGENCY, emergency_stops, judge, plan
 from planning.relief import LEFT, RIGHT, SPARE, eased, needed
 from planning.road import route
+from planning.scene import Scene
 from planning.shapes import boundary, no_obstacles
 from planning.situation import network, predict
 from tests.small_streets import PLANNER, WIDTH, User, tracks, two_way

@@ -11,8 +11,9 @@ from experiments.closed_loop import Mind, Thought
 from experiments.scenarios.driving import DriveScene
 from planning.candidates import Goal, Keep, follow
 from planning.frenet import FrenetState
-from planning.planner import Planner, Scene
+from planning.planner import Planner
 from planning.road import Route, Tracks
+from planning.scene import Scene
 from planning.shapes import Obstacles, boundary
 
 

@@ -10,8 +10,10 @@ import numpy as np
 from planning.candidates import stop
 from planning.frenet import Pose, to_frenet
 from planning.optimal import Refined, refine
-from planning.planner import Plan, Planner, Scene, plan
+from planning.planner import Planner, plan
+from planning.plans import Plan
 from planning.reference import from_points
+from planning.scene import Scene
 from planning.shapes import Obstacles, boundary
 
 LINE = 60.0  # where the front must stop [m]

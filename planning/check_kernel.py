@@ -34,6 +34,8 @@ REASONS = (
     "cannot stop beyond the horizon",
 )
 ROUNDING = 1.0 + 1e-9  # of a sum of chances that is just the risk
+ON_LIMITS = (*range(1, NUM_MARGINS + 1), CURVATURE_RATE, BEYOND)  # reasons that other limits may not give
+LEAP = 4  # steps between those looked at in a hurry
 CRAWLING = 0.1  # below it the rate of curvature is not looked at: at rest it is free [m/s]
 
 
@@ -144,16 +146,38 @@ def in_plane(a, d, pose):  # type: ignore[no-untyped-def]
         )
 
 
+@njit(error_model="numpy", inline="always")
+def sigmas_at(pose, k, r, middle, circles, radius):  # type: ignore[no-untyped-def]
+    """The least z of the vehicle's circles at step k from a rectangle (11, K); infinity where it is far away."""
+    dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
+    z = math.inf
+    if not dx * dx + dy * dy > r[10, k]:
+        for i in range(len(circles)):
+            x, y = pose[0, k] + circles[i] * pose[2, k], pose[1, k] + circles[i] * pose[3, k]
+            told = sigmas_of(
+                x, y, r[0, k], r[1, k], r[2, k], r[3, k], r[4, k], r[5, k], r[6, k], r[7, k], r[8, k], radius
+            )[0]
+            z = told if not told >= z else z  # NaN is not clear
+    return z
+
+
 @njit(error_model="numpy")
-def first_rectangle(pose, rectangles, chances, middle, circles, radius):  # type: ignore[no-untyped-def]
+def first_rectangle(pose, rectangles, chances, middle, circles, radius, order, hurry):  # type: ignore[no-untyped-def]
     """The first step at which a circle may touch a rectangle, more likely than the risk, or K. Where no rectangle but
     their sum is, sum_m p_m Phi(-z_m) with the least z of each, it is the step of the likeliest.
 
     rectangles (M, 11, K) of planning.shapes.Obstacles.table; chances: risk, and of each rectangle (M,) the probability,
-    the z below which it alone is too much, and the chance that is left where it is not near."""
+    the z below which it alone is too much, and the chance that is left where it is not near; order (M,) in which they
+    are looked at. In a hurry any such step will do, and the rectangle that was found comes first the next time, for the
+    next candidate is like this one."""
     risk, probability, alone, far = chances
     first, total, likeliest, at = pose.shape[1], 0.0, -1.0, pose.shape[1]
-    for m in range(rectangles.shape[0]):
+    if hurry and len(order):
+        for k in range(first - 1, -1, -LEAP):
+            if not sigmas_at(pose, k, rectangles[order[0]], middle, circles, radius) > alone[order[0]]:
+                return k
+    for n in range(len(order)):
+        m = order[n]
         r, near = rectangles[m], 0
         for k in range(first):  # on vectors: most are far away
             dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
@@ -163,16 +187,7 @@ def first_rectangle(pose, rectangles, chances, middle, circles, radius):  # type
             continue
         least, worst = math.inf, first
         for k in range(first):
-            dx, dy = pose[0, k] + middle * pose[2, k] - r[0, k], pose[1, k] + middle * pose[3, k] - r[1, k]
-            if dx * dx + dy * dy > r[10, k]:
-                continue
-            z = math.inf
-            for n in range(len(circles)):
-                x, y = pose[0, k] + circles[n] * pose[2, k], pose[1, k] + circles[n] * pose[3, k]
-                told = sigmas_of(
-                    x, y, r[0, k], r[1, k], r[2, k], r[3, k], r[4, k], r[5, k], r[6, k], r[7, k], r[8, k], radius
-                )[0]
-                z = told if not told >= z else z  # NaN is not clear
+            z = sigmas_at(pose, k, r, middle, circles, radius)
             if not z > alone[m]:
                 first = k
                 break
@@ -182,14 +197,26 @@ def first_rectangle(pose, rectangles, chances, middle, circles, radius):  # type
         total += chance
         if chance > likeliest:
             likeliest, at = chance, worst
+        if hurry and (first < pose.shape[1] or total > risk * ROUNDING):
+            for i in range(n, 0, -1):
+                order[i] = order[i - 1]
+            order[0] = m
+            break
     return min(first, at) if total > risk * ROUNDING else first
 
 
 @njit(error_model="numpy")
-def first_touch(a, pose, end, stop, lines, rectangles, chances, middle, circles, radius):  # type: ignore[no-untyped-def]
-    """The first thing that is passed or touched, and its step."""
+def first_touch(  # type: ignore[no-untyped-def]
+    a, pose, end, stop, lines, rectangles, chances, middle, circles, radius, order, hurry
+):  # fmt: skip
+    """The first thing that is passed or touched, and its step; in a hurry another road user, if there is one, for that
+    is quickly told."""
     num_steps = pose.shape[1]
     found, at = GOOD, num_steps
+    if hurry:
+        k = first_rectangle(pose, rectangles, chances, middle, circles, radius, order, hurry)
+        if k < num_steps:
+            return OBSTACLE, k
     if a[0, num_steps - 1] > min(stop, end):  # none drives backwards
         at = 0
         while not a[0, at] > min(stop, end):
@@ -198,8 +225,11 @@ def first_touch(a, pose, end, stop, lines, rectangles, chances, middle, circles,
     k = first_line(pose, lines, circles, radius)
     if k < at:
         found, at = BOUNDARY, k
-    k = first_rectangle(pose, rectangles, chances, middle, circles, radius)
-    return (OBSTACLE, k) if k < at else (found, at)
+    if not hurry:
+        k = first_rectangle(pose, rectangles, chances, middle, circles, radius, order, hurry)
+        if k < at:
+            return OBSTACLE, k
+    return found, at
 
 
 @njit(cache=True, error_model="numpy")
@@ -213,11 +243,11 @@ def judge(  # type: ignore[no-untyped-def]
     ahead (n, 9, K) of along_line, across (m, 3, K) of across_line; by_way (m,): the lateral motion is told by the way,
     with coefficients bends (m, 6) and lengths ways (m,); start (s, curvature of the path); end, stop: largest s;
     stand: s before which standing must be possible by `braking` after the horizon; first_good: look no farther than
-    the first good one."""
+    the first good one, and in a hurry."""
     num_lateral, num_steps = across.shape[0], across.shape[2]
     speed, curvature = np.empty(num_steps), np.empty(num_steps)
     told, pose = np.empty((3, num_steps)), np.empty((4, num_steps))
-    best = -1
+    best, sequence = -1, np.arange(len(rectangles))
     for c in order:
         i, j = c // num_lateral, c % num_lateral
         a, d = ahead[i], across[j]
@@ -230,7 +260,9 @@ def judge(  # type: ignore[no-untyped-def]
             found, k = CURVATURE_RATE, first_turn(speed, curvature, start[1], rate * dt)
             if k == num_steps:
                 in_plane(a, d, pose)
-                found, k = first_touch(a, pose, end, stop, lines, rectangles, chances, middle, circles, radius)
+                found, k = first_touch(
+                    a, pose, end, stop, lines, rectangles, chances, middle, circles, radius, sequence, first_good
+                )
                 if found == GOOD and a[0, num_steps - 1] + a[1, num_steps - 1] ** 2 / (2.0 * braking) > stand:
                     found = BEYOND
         reason[c], when[c] = found, k

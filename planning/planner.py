@@ -97,7 +97,7 @@ def plan(
     all_reasons        judge every candidate, not only those cheaper than the best: for pictures
 
     Raises InputError for a scene that is not one (shapes, NaN); anything else is answered with a plan."""
-    from planning.check_kernel import GOOD, OBSTACLE
+    from planning.check_kernel import GOOD, OBSTACLE, ON_LIMITS
 
     check(scene, planner.radius, planner.num_steps)
     made = candidates_of(planner, scene, previous, elapsed)
@@ -108,10 +108,11 @@ def plan(
     rejected = turned_down(judged)
     if judged.best >= 0:
         return chosen(scene, judged, judged.best, COMFORT, rejected)
-    relaxed = judge(planner, scene, made, planner.able)
+    again = judged.order[np.isin(judged.reason[judged.order], ON_LIMITS)]
+    relaxed = judge(planner, scene, made._replace(order=again), planner.able)
     if relaxed.best >= 0:
         return chosen(scene, judged._replace(best=relaxed.best), relaxed.best, RELAXED, rejected)
-    stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able)
+    stops = judge(planner, scene, emergency_stops(planner, scene, previous, elapsed), planner.able, first_good=False)
     best = stops.best if stops.best >= 0 else least_harm(planner, scene, stops)
     stays = abs(scene.state.ds) < AT_REST and stops.reason[best] in (GOOD, OBSTACLE)
     return chosen(scene, stops, best, COMFORT if stays else EMERGENCY, rejected)
@@ -161,7 +162,8 @@ def emergency_stops(planner: Planner, scene: Scene, previous: Plan | None, elaps
 
 
 def judge(planner: Planner, scene: Scene, made: Candidates, limits: Limits, *, first_good: bool = True) -> Candidates:
-    """Candidates with reasons, cheapest first, up to the first good one (all of them unless `first_good`)."""
+    """Candidates with reasons, cheapest first, up to the first good one, where a reason is one that holds; unless
+    `first_good` all of them, each with what it breaks first."""
     from planning import check_kernel as kernel
 
     dt = planner.step
@@ -188,7 +190,7 @@ def judge_states(planner: Planner, scene: Scene, along: Floats, across: Floats, 
     unused = Polynomials(np.zeros((1, 6)), np.zeros(1))  # coefficients: only of motions told by the way
     order, by_way = np.zeros(1, np.int64), np.zeros(1, np.bool_)
     told = np.ascontiguousarray(across.T)[None]
-    _, reason, when = _judged(planner, scene, limits, order, ahead, told, by_way, unused, True)
+    _, reason, when = _judged(planner, scene, limits, order, ahead, told, by_way, unused, False)
     return kernel.REASONS[reason[0]], int(when[0])
 
 

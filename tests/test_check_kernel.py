@@ -111,7 +111,10 @@ def test_the_first_thing_met_is_the_reason() -> None:
 
     def met(end: float, stop: float, lines: bool, boxes: bool) -> tuple[int, int]:
         given = tuple((wall if lines else nowhere)[:6])
-        found, at = first_touch(a, pose, end, stop, given, box[: int(boxes)], CERTAIN, 0.0, np.zeros(1), 0.5)
+        told = (box[: int(boxes)], CERTAIN, 0.0, np.zeros(1), 0.5, np.arange(int(boxes)))
+        found, at = first_touch(a, pose, end, stop, given, *told, False)
+        hurried, _ = first_touch(a, pose, end, stop, given, *told, True)
+        assert hurried == found or (hurried == OBSTACLE and boxes)
         return int(found), int(at)
 
     far = math.inf
@@ -131,9 +134,14 @@ def test_far_rectangles_are_told_by_the_middle_of_the_vehicle() -> None:
     row[0, [2, 4, 5]] = [[1.0], [1.0], [1.0]]
     row[0, 0], row[0, 10] = 7.0, 2.0**2  # a rectangle at x = 7 counts as near from x = 5 on
     pose = np.array([[1.0], [0.0], [1.0], [0.0]])
-    assert first_rectangle(pose, row, CERTAIN, 3.9, np.array([8.0]), 1.0) == 1
-    assert first_rectangle(pose, row, CERTAIN, 4.1, np.array([8.0]), 1.0) == 0
-    assert first_rectangle(np.array([[0.0], [1.0], [0.0], [1.0]]), row * 1.0, CERTAIN, 3.9, np.array([8.0]), 1.0) == 1
+    assert first_rectangle(pose, row, CERTAIN, 3.9, np.array([8.0]), 1.0, np.arange(1), False) == 1
+    assert first_rectangle(pose, row, CERTAIN, 4.1, np.array([8.0]), 1.0, np.arange(1), False) == 0
+    assert (
+        first_rectangle(
+            np.array([[0.0], [1.0], [0.0], [1.0]]), row * 1.0, CERTAIN, 3.9, np.array([8.0]), 1.0, np.arange(1), False
+        )
+        == 1
+    )
 
 
 def uniform(**given: float) -> str:

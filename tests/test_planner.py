@@ -186,6 +186,26 @@ def test_every_judgement_is_that_of_the_formulas(speed: float) -> None:
     assert first.best == (found.order[good[found.order]][0] if good.any() else -1)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_in_a_hurry_the_same_candidates_are_good(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    boxes = [rectangle(rng.uniform(35, 80), rng.uniform(-4, 6), rng.uniform(-4, 6), 0.3, rng.uniform()) for _ in "1234"]
+    obstacles = Obstacles(*(np.concatenate(parts) for parts in zip(*boxes, strict=True)))
+    open_ = scene(START, Keep(14.0), offsets=np.linspace(-2.0, 3.5, 6), obstacles=obstacles)
+    lines = boundary([LINE.place(np.arange(0, 120, 1.0), d) for d in (-2.6, 4.5)], PLANNER.radius)
+    given = open_._replace(boundary=lines, stop=62.0, stand=64.0)
+    made = candidates_of(PLANNER, given)
+    exact = judge(PLANNER, given, made, PLANNER.able, first_good=False)
+    bad, good = (exact.order[part] for part in (exact.reason[exact.order] > 0, exact.reason[exact.order] == 0))
+    assert len(good) and len(bad) > 100
+    hurried = judge(PLANNER, given, made._replace(order=np.r_[bad, good]), PLANNER.able)
+    assert hurried.best == good[0] and (hurried.reason[good[1:]] == -1).all()
+    other = bad[hurried.reason[bad] != exact.reason[bad]]
+    assert {REASONS[r] for r in hurried.reason[other]} <= {"other road user"}
+    touching = judge(PLANNER, open_, made, PLANNER.able, first_good=False)
+    assert {REASONS[r] for r in touching.reason[other]} <= {"other road user"}
+
+
 def test_a_motion_told_as_states_is_judged_like_a_candidate() -> None:
     given = scene(START, Keep(14.0), offsets=np.linspace(-2.0, 3.5, 6), obstacles=rectangle(45.0, 1.0, 3.0, 0.2))
     limits = Limits(speed=12.0, acceleration=2.2, curvature_rate=0.1)

@@ -87,9 +87,11 @@ def test_a_place_uncertain_in_one_direction_only_is_met_beside_it_as_if_it_were_
         margin = margins(row, np.stack([1.9 * left, 2.1 * left]), 1.0)
         assert margin[0] < 0 < margin[1]
         pose = np.array([[1.9 * left[0]], [1.9 * left[1]], [1.0], [0.0]])
-        assert first_rectangle(pose, row[None, :, None], CERTAIN, 0.0, np.zeros(1), 1.0) == 0
+        assert first_rectangle(pose, row[None, :, None], CERTAIN, 0.0, np.zeros(1), 1.0, np.arange(1), False) == 0
         row[6] = math.nan
-        assert first_rectangle(pose * 1.2, row[None, :, None], CERTAIN, 0.0, np.zeros(1), 1.0) == 0, "NaN is not clear"
+        assert (
+            first_rectangle(pose * 1.2, row[None, :, None], CERTAIN, 0.0, np.zeros(1), 1.0, np.arange(1), False) == 0
+        ), "NaN is not clear"
 
 
 @pytest.mark.parametrize("seed", range(3))

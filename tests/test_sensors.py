@@ -307,6 +307,14 @@ def test_empty_and_huge_scans_are_scans() -> None:
     assert [scan.time for scan in model.check(frames)] == [1.5, 1.5]
 
 
+def test_gaps_of_more_than_an_hour_are_mistaken_units() -> None:
+    model = Traffic((SENSORS[1],))
+    hour, more = (SCAN._replace(time=SCAN.time + seconds) for seconds in (3600.0, 3601.0))
+    assert len(model.check([hour, SCAN])) == 2
+    with pytest.raises(InputError, match=r"comes 3601 s after the one before, .* give times in seconds"):
+        model.check([more, SCAN])
+
+
 def test_a_mount_turns_with_the_car() -> None:
     """One metre ahead and two to the left, on a car that looks along (.6, .8)."""
     pose = np.array([10.0, 20.0, math.atan2(0.8, 0.6)])

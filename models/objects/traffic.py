@@ -40,6 +40,7 @@ from models.unroll import unroll
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 FLAT = 100.0  # a prior this many times wider than a measurement is taken for uniform: it adds 1e-4 of its information
+LONGEST_GAP = 3600.0  # between scans: longer ones are mistaken units [s]
 CELLS = 64  # along each side of the region, of what a map says of it in the program
 HEADINGS, HEADING_STD = 4, 0.5  # about which a heading that nobody measured is normal, for a uniform one [rad]
 
@@ -262,12 +263,18 @@ class Traffic:
 
     def check(self, scans: Recording | Sequence[Scan | ScanFrame]) -> tuple[Scan, ...]:
         """The scans in the order given, those of frames for frames. Raises InputError for a sensor that the model has
-        not, and for numbers that no sensor gives (models.objects.scans)."""
+        not, for numbers that no sensor gives (models.objects.scans), and for a gap of more than LONGEST_GAP."""
         found = list[Scan]()
         for scan in scans.scans if isinstance(scans, Recording) else scans:
             scan = scan.scan if isinstance(scan, ScanFrame) else scan
             sensor = self.sensor(scan)
             found.append(check_scan(scan, sensor.names, len(self.kinds)))
+        times = np.sort([scan.time for scan in found])
+        for late in np.flatnonzero(np.diff(times) > LONGEST_GAP):
+            raise InputError(
+                f"the scan at {times[late + 1]} s comes {times[late + 1] - times[late]:g} s after the one before, when "
+                "nobody seen then is left; give times in seconds, or the parts one by one"
+            )
         return tuple(found)
 
     def __call__(self, frames: Sequence[ScanFrame]) -> None:

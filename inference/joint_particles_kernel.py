@@ -7,7 +7,8 @@ from numba import njit
 
 from inference.association_kernel import AUTO, MISSED, associate, choose
 from inference.association_random import uniform
-from inference.lmb_kernel import MAX_ITERATIONS, TOLERANCE, densities, longer, room_for, unseen_mass
+from inference.kalman_kernel import densities, room_for
+from inference.lmb_kernel import MAX_ITERATIONS, TOLERANCE, longer, unseen_mass
 from inference.object_particles import LEAST_MISS
 
 

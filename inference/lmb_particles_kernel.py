@@ -6,16 +6,8 @@ import numpy as np
 from numba import njit
 
 from inference.association_kernel import AUTO, associate
-from inference.lmb_kernel import (
-    MAX_ITERATIONS,
-    TOLERANCE,
-    densities,
-    longer,
-    project,
-    room_for,
-    unseen_mass,
-    wrapped,
-)
+from inference.kalman_kernel import densities, project, room_for, wrapped
+from inference.lmb_kernel import MAX_ITERATIONS, TOLERANCE, longer, unseen_mass
 from inference.object_particles import LEAST_MISS
 
 

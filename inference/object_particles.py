@@ -24,7 +24,7 @@ import math
 import numpy as np
 from numba import njit
 
-from inference.lmb_kernel import cholesky, condition, gain, innovation, room_for, whiten, wrapped
+from inference.kalman_kernel import cholesky, condition, gain, innovation, room_for, whiten, wrapped
 
 LEAST_MISS = 1e-12  # 1 - p_D is taken for no less, so that an object that cannot be missed can be
 

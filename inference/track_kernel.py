@@ -1,6 +1,6 @@
 """Machine code of tracks whose measurements are given: Kalman's update by them, and what others would weigh.
 
-Arrays are those of models.multi_object and of inference.lmb_kernel, of which all mathematics is.
+Arrays are those of models.multi_object and of inference.lmb_kernel; the mathematics is that of inference.kalman_kernel.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from inference.lmb_kernel import LOG_TAU, condition, densities, gain, innovation, room_for
+from inference.kalman_kernel import LOG_TAU, condition, densities, gain, innovation, room_for
 
 
 @njit(cache=True, error_model="numpy")

@@ -13,6 +13,7 @@ from benchmarks.figure import Figure, Measurement, Value, Values
 from benchmarks.planning_scene import Effort
 from experiments.closed_loop import drive
 from experiments.closed_loop_metrics import metrics
+from experiments.goal_metrics import goals
 from inference.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +43,7 @@ def scores(effort: Effort) -> dict[str, dict[str, float]]:
             began = time.process_time()
             driven = drive(scenario, mind, planner, loop, seed=0)
             spent = time.process_time() - began
-            found[name] = metrics(driven) | {"cycles": len(driven.plans), "seconds": spent}
+            found[name] = metrics(driven) | goals(driven) | {"cycles": len(driven.plans), "seconds": spent}
             bar.advance(1)
     return found
 
@@ -67,6 +68,8 @@ def closed_loops(effort: Effort) -> Values:
     hit = {name: one["collisions"] for name, one in found.items() if one["collisions"]}
     cycles = [one["cycles"] for one in found.values()]
     emergency = np.average([one["emergency"] for one in found.values()], weights=cycles)
+    asked = {name: one["goal_reached"] for name, one in found.items() if "goal_reached" in one}
+    missed = ", ".join(name for name, reached in asked.items() if not reached)
     ms = np.median([one["cycle_median_ms"] for one in found.values()])
     return {
         "collisions_at_fault": total("collisions_at_fault"),
@@ -77,6 +80,9 @@ def closed_loops(effort: Effort) -> Values:
         "gap_error_m": largest("gap_error_m"),
         "emergency_share": Value(float(emergency), f"of {sum(cycles):g} cycles"),
         "unclear_share": Value(float(np.average([one["unclear"] for one in found.values()], weights=cycles))),
+        "goal_share": Value(
+            float(np.mean([*asked.values()])) if asked else None, f"of {len(asked)}; not {missed or '-'}"
+        ),
         "cycle_ms": Value(float(ms), "median over drives of the median over cycles"),
     }
 
@@ -108,6 +114,7 @@ MEASUREMENTS = (
             ),
             Figure("emergency_share", "", "share of cycles that ended in an emergency stop"),
             Figure("unclear_share", "", "share of cycles whose plan may touch something, standing ones included"),
+            Figure("goal_share", "", "share of the recorded problems whose goal is reached as asked for, in time"),
             Figure("cycle_ms", "ms", "wall time of a cycle from tracks to plan", "cycles of 150 ms"),
         ),
         closed_loops,

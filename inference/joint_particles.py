@@ -151,9 +151,10 @@ def step(
     table, log_seen, mass, share, loopy = weigh(
         start, order, belief.kind, survival, covariance, *unseen, *view, knobs.gate, knobs.max_shared
     )
+    if not np.isfinite(log_seen).all():
+        raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
     joint = belief.log_weight + log_seen
-    if not np.isfinite(log_factor := weights.log_sum(joint)):
-        raise FloatingPointError(f"no particle explains the scan of sensor '{scan.sensor}' at {scan.time} s")
+    log_factor = weights.log_sum(joint)
     log_weight, parent, worth = joint - log_factor, np.arange(num), weights.effective_size(joint)
     if worth < knobs.ess * num:
         parent, log_weight = weights.systematic(joint, num, rng.random()), np.full(num, -math.log(num))

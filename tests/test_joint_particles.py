@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -403,3 +404,11 @@ def test_particles_that_are_worth_little_are_flagged() -> None:
     many = joint_particles.run(small(), WINDOW, num_particles=2000)
     assert any("they may have lost the truth" in flag for flag in few.info["flags"])
     assert not many.info["flags"]
+
+
+@pytest.mark.parametrize("wrong", [{"clutter": math.nan}, {"detection": (math.nan, 0.5)}])
+def test_no_nan_of_a_model_passes(wrong: Any) -> None:
+    """Though other particles, without such objects, explain the scan."""
+    knobs = joint_particles.Knobs(num_particles=40)
+    with pytest.raises(FloatingPointError, match=r"the update by sensor 'line' at 0.4 s made a NaN"):
+        joint_particles.step(Line(**wrong), scenes(40, 10), LOOK, 0, knobs, 0)

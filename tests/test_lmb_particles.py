@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from inference import lmb, lmb_particles
 from inference.object_particles import draw, log_corrections, moments, widen
 from inference.tracks import Tracks
-from models.multi_object import Bernoullis, Components, no_objects
+from models.multi_object import Bernoullis, Components, View, no_objects
 from models.objects.motion import ConstantTurn, ConstantVelocity
 from models.objects.scans import Recording, Scan
 from models.objects.scene import simulate_scan
 from models.objects.sensors import Position, Radar, RangeBearing
 from models.objects.traffic import Kind, Place, Traffic
 from models.program import InputError
-from tests.line_objects import Line, enumerate_posterior, scan_at
+from tests.line_objects import Line, LineScan, enumerate_posterior, scan_at
 
 Floats = NDArray[np.float64]
 POSE = np.zeros(3)
@@ -488,3 +488,17 @@ def test_no_nan_of_a_model_passes(wrong: Any) -> None:
     belief = lmb_particles.nobody(2, 400) if "clutter" in wrong else two_clouds()
     with pytest.raises(FloatingPointError, match=r"the update by sensor 'line' at 0.4 s made a NaN"):
         lmb_particles.step(Line(**wrong), belief, LOOK, 0, EVERYTHING, 0)
+
+
+class HoleAhead(Line):
+    """Detection is NaN a little off where an object is expected."""
+
+    def view(self, scan: LineScan, objects: Bernoullis, more: Components) -> View:
+        found = super().view(scan, objects, more)
+        return found._replace(detection=np.where(found.predicted[:, 0] > 1.0, math.nan, found.detection))
+
+
+def test_no_nan_of_what_is_drawn_passes() -> None:
+    belief = certain(np.zeros(2), np.zeros(2), 100, 0)
+    with pytest.raises(FloatingPointError, match=r"the update by sensor 'line' at 0.4 s made a NaN"):
+        lmb_particles.step(HoleAhead(noise=(10.0, 10.0)), belief, scan_at(0.4, ()), 0, lmb_particles.Knobs(100), 0)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from experiments.scenarios.close_targets import close_targets
 from inference import joint_particles, lmb
+from inference.joint_particles_kernel import associations
 from models.multi_object import Bernoullis, Components, no_objects
 from models.objects.motion import ConstantTurn, ConstantVelocity
 from models.objects.scans import Scan
@@ -370,6 +371,20 @@ def test_kernels_are_those_of_an_objects_families_and_weights() -> None:
         np.testing.assert_allclose(w @ parts.mean[own], w @ before[own], atol=1e-9)
         np.testing.assert_allclose(np.cov(parts.mean[own].T, aweights=w, bias=True), (1 - h**2) * V, atol=1e-9)
         np.testing.assert_allclose(parts.covariance[own] - noise, np.tile(h**2 * V, (own.sum(), 1, 1)), atol=1e-9)
+
+
+def test_newborns_are_of_the_components_that_most_probably_made_their_measurement() -> None:
+    """Nobody there, two measurements: each begins an object with its share, of components as their masses say. Counts
+    are within 4.5 binomial standard errors."""
+    num, none, mass, share = 20_000, np.zeros(0, dtype=np.int64), np.array([1.0, 2.0, 5.0, 0.3]), np.array([0.6, 1.0])
+    table = (np.zeros(1, dtype=np.int64), none, np.zeros(0), np.zeros(0))
+    start, offset, random = np.zeros(num + 1, dtype=np.int64), np.array([0, 3, 4]), np.array([7], dtype=np.uint64)
+    *old, whose, made, part = associations(start, table, np.arange(num), offset, mass, share, 8, 50, random)
+    assert all(len(column) == 0 for column in old)
+    np.testing.assert_array_equal(made, part == 3)
+    np.testing.assert_array_equal(whose[made == 1], np.arange(num))
+    for u, expected in enumerate((0.075, 0.15, 0.375)):
+        assert abs((part == u).mean() * len(part) / num - expected) < 4.5 * math.sqrt(expected / num)
 
 
 def test_newborns_families_are_counted_within_their_measurement() -> None:

@@ -22,7 +22,7 @@ ROOTS[1, :, 2] = 0.0  # the second is flat
 P = ROOTS @ ROOTS.swapaxes(1, 2)
 PERIOD = np.array([math.inf, 4.0])
 PREDICTED = RNG.uniform(-1.9, 1.9, (3, 2))
-VALUES, SORT = RNG.uniform(-1.9, 1.9, (3, 2)), np.array([0, 1, 0])
+VALUES, SORT = np.array([[0.4, 1.8], [-1.0, -1.8], [0.7, 1.5]]), np.array([0, 1, 0])
 PAIRS = [(0, 0), (0, 1), (0, -1), (1, -1), (1, 1), (0, 1), (2, 1), (2, 2), (1, 2), (0, 2), (0, 1)]
 
 
@@ -68,6 +68,7 @@ def test_corrections_are_ratios_of_exact_and_linear_likelihoods() -> None:
     component, measurement = np.array(PAIRS).T.copy()
     num = len(PAIRS)
     state, seen = RNG.standard_normal((num, 3)), RNG.uniform(-1.9, 1.9, (num, 2))
+    seen[:, 1] = -0.9 * VALUES[measurement, 1]  # more than half a period off
     detected, detection = RNG.uniform(0.1, 0.9, num), np.array([0.3, 0.5, 0.8])
     about = (MEAN, PREDICTED, SLOPE, detection, VALUES, NOISE, SORT, PERIOD)
     found = log_corrections(state, seen, detected, component, measurement, *about)
@@ -90,7 +91,7 @@ def test_what_cannot_be_missed_but_is_has_finite_weights() -> None:
     np.testing.assert_allclose(found, [0.0, math.log(0.5 / LEAST_MISS)], rtol=1e-12)
 
 
-@pytest.mark.parametrize("period", [math.tau, 10.0])
+@pytest.mark.parametrize("period", [math.tau, 100.0])
 def test_moments_of_several_clouds_are_weighted_and_unwound(period: float) -> None:
     """Lopsided, within half a period of their middle and across the seam; one cloud weighs nothing."""
     rng, num = np.random.default_rng(0), 300
@@ -107,6 +108,14 @@ def test_moments_of_several_clouds_are_weighted_and_unwound(period: float) -> No
         np.testing.assert_allclose(V[g], np.cov(x[own].T, aweights=weight[own], bias=True), atol=1e-9)
     assert not mean[1].any()
     assert not V[1].any()
+
+
+def test_moments_far_from_the_origin_keep_their_digits() -> None:
+    """A thousand kilometres away, of a cloud that is probably not there: its width is a centimetre nonetheless."""
+    rng, weight = np.random.default_rng(0), np.full(100, 1e-3)
+    x, one, none = 0.01 * rng.standard_normal((100, 1)), np.zeros(100, dtype=np.int64), np.full(1, math.inf)
+    _, V = moments(one, 1, weight, x + 1e6, none)
+    np.testing.assert_allclose(V[0, 0, 0], x.var(), rtol=1e-6)
 
 
 def test_kernels_are_of_each_cloud_and_know_of_angles() -> None:

@@ -37,7 +37,7 @@ def weigh(  # type: ignore[no-untyped-def]
     for k in range(rows):
         c = order[k]
         alive = survival[c] * detection[c]
-        missed[k] = LEAST_MISS if alive > 1.0 - LEAST_MISS else 1.0 - alive  # a NaN stays one
+        missed[k] = max(1.0 - alive, LEAST_MISS)
         if alive > 1e-9:
             densities(P[c], slope[c], predicted[c], values, every, noise, sort, period, gate, room, density)
             for j in range(M):

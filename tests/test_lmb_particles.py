@@ -353,6 +353,14 @@ def test_a_step_from_known_particles_is_that_of_all_histories() -> None:
         np.testing.assert_array_less(np.abs(told.mean[i] - mean), 5 * sd / math.sqrt(400))
 
 
+def test_existence_falls_where_nothing_is_seen() -> None:
+    belief, empty = two_clouds(), scan_at(0.4, ())
+    answer = enumerate_posterior(LINE, 0.0, belief.as_components(np.zeros((800, 2, 2))), [empty], lmb.STRIDE)
+    after, _ = lmb_particles.step(LINE, belief, empty, 0, EVERYTHING, 2)
+    np.testing.assert_allclose(after.existence, [answer.existence(-2), answer.existence(-1)], atol=1e-9)
+    assert np.all(after.existence < 0.7 * belief.existence)
+
+
 def test_particles_are_resampled_as_often_as_they_weigh_on_average() -> None:
     """Of ten particles the light one is drawn with the probability of its weight times 1 - p_D, never or else once."""
     none = np.zeros((1, 10), dtype=np.int64)

@@ -112,10 +112,13 @@ def predict(
         draw_prior(component, parts.mean, parts.covariance, rng.standard_normal((len(component), size))),
         component - parts.offset[which],
     )
-    label, particle, kind, state, family = map(np.concatenate, zip(belief[2:-1], fresh, strict=True))
+    survival = np.concatenate([survival, np.ones(len(component))])
+    covariance = np.concatenate([covariance, np.zeros((len(component), size, size))])
+    rows = [*map(np.concatenate, zip(belief[2:-1], fresh, strict=True)), survival, covariance]
+    by = np.lexsort((rows[1], rows[0]))  # what a late scan began has higher labels
+    label, particle, kind, state, family, survival, covariance = (row[by] for row in rows)
     belief = belief._replace(label=label, particle=particle, kind=kind, state=state, family=family)
-    none = np.zeros((len(component), size, size))
-    return belief, np.concatenate([survival, np.ones(len(component))]), np.concatenate([covariance, none])
+    return belief, survival, covariance
 
 
 def by_label(belief: Scenes, covariance: Floats, period: Floats, kernel: float) -> Bernoullis:
@@ -148,9 +151,10 @@ def step(
     table, log_seen, mass, share, loopy = weigh(
         start, order, belief.kind, survival, covariance, *unseen, *view, knobs.gate, knobs.max_shared
     )
+    if not np.isfinite(log_seen).all():
+        raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
     joint = belief.log_weight + log_seen
-    if not np.isfinite(log_factor := weights.log_sum(joint)):
-        raise FloatingPointError(f"no particle explains the scan of sensor '{scan.sensor}' at {scan.time} s")
+    log_factor = weights.log_sum(joint)
     log_weight, parent, worth = joint - log_factor, np.arange(num), weights.effective_size(joint)
     if worth < knobs.ess * num:
         parent, log_weight = weights.systematic(joint, num, rng.random()), np.full(num, -math.log(num))

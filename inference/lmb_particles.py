@@ -188,13 +188,16 @@ def meet(
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
     """States (D, n) drawn from components (D,) of `parts` given measurements (D,), and the logs of their weights (D,).
-    `view` is of these components; the objects may hide others."""
+    `view` is of these components; the objects may hide others. Raises FloatingPointError where that makes a NaN."""
     rest = (view.values, view.noise, view.sort, view.period)
     normal = rng.standard_normal((len(component), parts.mean.shape[1]))
     state = draw(component, measurement, parts.mean, parts.covariance, view.predicted, view.slope, *rest, normal)
     seen, detected = look(model, scan, objects, parts.kind[component], state)
     about = (parts.mean, view.predicted, view.slope, view.detection)
-    return state, log_corrections(state, seen, detected, component, measurement, *about, *rest)
+    log_weight = log_corrections(state, seen, detected, component, measurement, *about, *rest)
+    if np.isnan(state).any() or np.isnan(detected).any() or np.isnan(log_weight).any():
+        raise FloatingPointError(f"the update by sensor '{scan.sensor}' at {scan.time} s made a NaN")
+    return state, log_weight
 
 
 def look(model: HasObjects, scan: Timed, objects: Bernoullis, kind: Ints, state: Floats) -> tuple[Floats, Floats]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +12,14 @@ from numpy.typing import NDArray
 from inference import lmb, lmb_particles
 from inference.object_particles import draw, log_corrections, moments, widen
 from inference.tracks import Tracks
-from models.multi_object import Bernoullis, Components, no_objects
+from models.multi_object import Bernoullis, Components, View, no_objects
 from models.objects.motion import ConstantTurn, ConstantVelocity
 from models.objects.scans import Recording, Scan
 from models.objects.scene import simulate_scan
 from models.objects.sensors import Position, Radar, RangeBearing
 from models.objects.traffic import Kind, Place, Traffic
 from models.program import InputError
+from tests.line_objects import Line, LineScan, enumerate_posterior, scan_at
 
 Floats = NDArray[np.float64]
 POSE = np.zeros(3)
@@ -73,6 +75,8 @@ def test_long_gaps_have_the_noise_of_all_their_steps() -> None:
     error = np.cov(state.T) + rest[0] - Q
     assert np.all(np.abs(error) < 5 * np.outer(std, std) * math.sqrt(2 / num))
     np.testing.assert_allclose(survival, math.exp(-dt / model.kinds[0].lifetime), rtol=1e-12)
+    last = lmb.LONGEST
+    np.testing.assert_allclose(rest[0, [0, 2], [0, 2]], [last**3 / 3, last], rtol=1e-12)
 
 
 def test_kernels_are_those_of_families() -> None:
@@ -314,3 +318,195 @@ def test_empty_scans_of_nobody_are_scans() -> None:
     found = lmb_particles.run(plots(), scans, num_particles=50)
     assert np.diff(found.offset).tolist() == [0, 0, 0, 1]
     assert found.existence == pytest.approx(lmb.run(plots(), scans).existence, rel=1e-9)
+
+
+LINE = Line(unseen_number=0.4)
+LOOK = scan_at(0.4, (0.3, 2.0), (0.3, 4.0))
+EVERYTHING = lmb_particles.Knobs(num_particles=400, kernel=0.0, gate=math.inf, faint=0.0)
+
+
+def two_clouds(num: int = 400) -> lmb_particles.Clouds:
+    """Two objects of uneven particles, calm ones first."""
+    rng, none = np.random.default_rng(4), np.zeros((2, num), dtype=np.int64)
+    weight, kind = rng.uniform(0.2, 1.0, (2, num)), none + (np.arange(num) >= 0.6 * num)
+    state = rng.normal([0.2, 0.0], [1.0, 0.7], (2, num, 2)) + np.array([[[0.0, 0.4]], [[1.5, -0.3]]])
+    weight /= weight.sum(1, keepdims=True)
+    return lmb_particles.Clouds(0.0, np.array([-2, -1]), np.array([0.7, 0.45]), weight, kind, state, none)
+
+
+def test_a_step_from_known_particles_is_that_of_all_histories() -> None:
+    """Two kinds, unlike features: existence and evidence exactly. Shares of kinds within what systematic resampling
+    leaves, one particle at each end of each of three measured runs; means within 5 standard errors."""
+    belief = two_clouds()
+    answer = enumerate_posterior(LINE, 0.0, belief.as_components(np.zeros((800, 2, 2))), [LOOK], lmb.STRIDE)
+    after, facts = lmb_particles.step(LINE, belief, LOOK, 0, EVERYTHING, 2)
+    assert facts.log_factor == pytest.approx(answer.log_sum, abs=1e-9)
+    assert facts.left_out == facts.loopy == 0.0
+    np.testing.assert_array_equal(after.label, [-2, -1, 0, 1])
+    told = lmb_particles.tell(after, 0.0, LINE.period, 2)
+    for i, label in enumerate(after.label):
+        exact, parts = answer.existence(label), answer.objects[label]
+        assert after.existence[i] == pytest.approx(exact, abs=1e-9)
+        assert told.kind[i, 1] == pytest.approx(sum(part.weight for part in parts if part.kind) / exact, abs=6 / 400)
+        mean = sum(part.weight * part.mean for part in parts) / exact
+        sd = np.sqrt(np.diag(told.covariance[i]))
+        np.testing.assert_array_less(np.abs(told.mean[i] - mean), 5 * sd / math.sqrt(400))
+
+
+def test_existence_falls_where_nothing_is_seen() -> None:
+    belief, empty = two_clouds(), scan_at(0.4, ())
+    answer = enumerate_posterior(LINE, 0.0, belief.as_components(np.zeros((800, 2, 2))), [empty], lmb.STRIDE)
+    after, _ = lmb_particles.step(LINE, belief, empty, 0, EVERYTHING, 2)
+    np.testing.assert_allclose(after.existence, [answer.existence(-2), answer.existence(-1)], atol=1e-9)
+    assert np.all(after.existence < 0.7 * belief.existence)
+
+
+def test_particles_are_resampled_as_often_as_they_weigh_on_average() -> None:
+    """Of ten particles the light one is drawn with the probability of its weight times 1 - p_D, never or else once."""
+    none = np.zeros((1, 10), dtype=np.int64)
+    weight, kind = np.full((1, 10), 0.98 / 9), none + (np.arange(10) == 9)
+    weight[0, 9] = 0.02
+    belief = lmb_particles.Clouds(0.0, none[:, 0], np.ones(1), weight, kind, np.zeros((1, 10, 2)), none)
+    knobs, empty, runs = EVERYTHING._replace(num_particles=10), scan_at(0.0, ()), 2000
+    light = [lmb_particles.step(LINE, belief, empty, k, knobs, 0)[0].kind.sum() for k in range(runs)]
+    calm, wild = 1.0 - np.array(LINE.detection)
+    expected = 10 * 0.02 * wild / (0.02 * wild + 0.98 * calm)
+    assert set(light) == {0, 1}
+    assert np.mean(light) == pytest.approx(expected, abs=4.5 * math.sqrt(expected / runs))
+
+
+def test_faint_objects_are_left_out_and_told_of() -> None:
+    everything, _ = lmb_particles.step(LINE, two_clouds(), LOOK, 3, EVERYTHING, 2)
+    for faint in np.sort(everything.existence)[:-1] + 1e-6:
+        some, facts = lmb_particles.step(LINE, two_clouds(), LOOK, 3, EVERYTHING._replace(faint=float(faint)), 2)
+        kept = everything.existence > faint
+        np.testing.assert_array_equal(some.label, everything.label[kept])
+        np.testing.assert_allclose(some.existence, everything.existence[kept], rtol=1e-12)
+        assert facts.left_out == pytest.approx(everything.existence[~kept].sum(), rel=1e-9)
+
+
+def test_large_groups_are_told_of() -> None:
+    _, facts = lmb_particles.step(LINE, two_clouds(), LOOK, 0, EVERYTHING._replace(max_shared=0), 0)
+    assert facts.loopy == 1
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_gate_is_about_all_that_particles_predict(side: float) -> None:
+    """On a circle of ten, across its seam: off^2 <= gate (var + H P H' + R) of the weighted particles, with the noise P
+    of the heaviest; measurements beyond are of nobody."""
+    model, gate, none = Line(period=np.array([10.0, math.inf])), 2.0, np.zeros((1, 3), dtype=np.int64)
+    place, kind, weight = np.array([4.9, 5.2, 5.9]), np.array([1, 0, 0]), np.array([0.3, 0.5, 0.2])
+    state = np.stack([np.remainder(place + 5.0, 10.0) - 5.0, np.zeros(3)], 1)
+    belief = lmb_particles.Clouds(0.0, none[:, 0], np.ones(1), weight[None], kind[None], state[None], none)
+    weight = weight * [model.survival(k, 0.4) for k in kind]
+    alive = weight.sum()
+    weight /= alive
+    mean = weight @ place
+    variance = weight @ (place - mean) ** 2 + model.spread(0, 0.4)[0, 0] + model.std**2
+    missed = 1.0 - alive * weight @ np.array(model.detection)[kind]
+    knobs = EVERYTHING._replace(num_particles=3, gate=gate)
+    for scale, within in ((0.999, True), (1.001, False)):
+        z = mean + side * scale * math.sqrt(gate * variance)
+        for turns in (-1, 0):
+            _, facts = lmb_particles.step(model, belief, scan_at(0.4, (z + 10.0 * turns,)), 0, knobs, 0)
+            alone = math.log(model.clutter * missed)
+            assert (facts.log_factor > alone + 0.1) if within else facts.log_factor == pytest.approx(alone, abs=1e-12)
+
+
+def test_missed_particles_weigh_as_much_as_they_could_be_missed() -> None:
+    """At the edge of a view, all from one state and the noise about it: w ~ 1 - p_D(x)."""
+    sensor = Position(name="plots", noise_std=(1.0, 1.0), detection=0.8, clutter=1.0, extent=20.0)
+    model = Traffic((sensor,), ConstantVelocity(), (Kind(noise=(10.0, 10.0), speed=(0.0, 2.0)),), unseen_density=1e-3)
+    belief = certain(np.array([19.0, 0.0, 0.0, 0.0]), np.zeros(4), 200, 0)
+    knobs = lmb_particles.Knobs(num_particles=200, kernel=0.0)
+    after, _ = lmb_particles.step(model, belief, Scan("plots", 0.5, np.zeros((0, 2)), POSE), 0, knobs, 0)
+    expected = 1.0 - 0.8 / (1.0 + np.exp((np.abs(after.state[0, :, 0]) - 20.0) / 0.5))
+    assert expected.std() > 0.1
+    np.testing.assert_allclose(after.weight[0], expected / expected.sum(), atol=1e-5)  # the sides of the view
+
+
+def test_components_are_taken_as_often_as_their_weight_says() -> None:
+    offset, weight = np.array([0, 3, 3, 5]), np.array([1.0, 0.0, 3.0, 0.2, 0.6])
+    found = lmb_particles.components_of(offset, weight, (0, 2), 1000, np.random.default_rng(0))
+    count = np.bincount(found[:1000], minlength=5)
+    assert np.all(np.abs(count - [250, 0, 750, 0, 0]) <= 1)
+    assert np.all(np.abs(np.bincount(found[1000:], minlength=5) - [0, 0, 0, 250, 750]) <= 1)
+
+
+def test_kernels_keep_the_moments_of_uneven_particles() -> None:
+    belief = two_clouds()
+    found = lmb_particles.regularise(belief, np.zeros((800, 2, 2)), LINE.period, 0.6).components
+    for t in range(2):
+        own, w = slice(400 * t, 400 * (t + 1)), belief.weight[t]
+        V = np.cov(belief.state[t].T, aweights=w, bias=True)
+        np.testing.assert_allclose(w @ found.mean[own], w @ belief.state[t], atol=1e-9)
+        np.testing.assert_allclose(np.cov(found.mean[own].T, aweights=w, bias=True), 0.64 * V, atol=1e-9)
+        np.testing.assert_allclose(found.covariance[own], np.tile(0.36 * V, (400, 1, 1)), atol=1e-9)
+
+
+def test_arrivals_have_labels_places_and_families_of_their_own() -> None:
+    """Headings about four ways, of which each is a family."""
+    places = (Place((10.0, 5.0), 2.0, 0.5), Place((-20.0, 0.0), 1.0, 1.5))
+    model = Traffic(plots().sensors, ConstantTurn(), (Kind(),), places=places)
+    moved, covariance = lmb_particles.predict(model, lmb_particles.nobody(6, 800), 0.4, 3, np.random.default_rng(0))
+    np.testing.assert_array_equal(moved.label, 3 * lmb.STRIDE + lmb.STRIDE // 2 + np.arange(2))
+    np.testing.assert_allclose(moved.existence, -np.expm1(-model.arrived(0.4)[1:].sum(1)), rtol=1e-12)
+    assert not covariance.any()
+    for t, place in enumerate(places):
+        np.testing.assert_allclose(moved.state[t, :, :2].mean(0), place.position, atol=5 * place.std / math.sqrt(800))
+        np.testing.assert_array_equal(np.bincount(moved.family[t]), [200] * 4)
+        for family in range(4):
+            turned = np.exp(1j * (moved.state[t, moved.family[t] == family, 2] - 0.5 * math.pi * family))
+            assert abs(np.angle(turned.mean())) < 5 * 0.5 / math.sqrt(200)
+
+
+def test_families_go_with_their_particles() -> None:
+    """Newborns' are their kind's here; that of an old particle is told by where it stands."""
+    belief = two_clouds()
+    far = np.arange(400) % 3
+    belief = belief._replace(state=belief.state + 50.0 * far[:, None], family=np.tile(far, (2, 1)))
+    scan = scan_at(0.4, (0.3, 52.0), (1.0, 2.0))
+    after, _ = lmb_particles.step(LINE, belief, scan, 0, EVERYTHING._replace(faint=1e-6), 0)
+    np.testing.assert_array_equal(after.label, [-2, -1, 0, 1])
+    np.testing.assert_array_equal(after.family[:2], np.rint((after.state[:2, :, 1]) / 50.0))
+    np.testing.assert_array_equal(after.family[2:], after.kind[2:])
+    assert set(after.family[:2].ravel()) == {0, 1, 2}
+
+
+def test_moments_that_are_told_are_weighted() -> None:
+    belief = two_clouds()
+    told = lmb_particles.tell(belief, 0.5, LINE.period, 2)
+    np.testing.assert_array_equal(told.label, [-2])
+    np.testing.assert_allclose(told.mean[0], belief.weight[0] @ belief.state[0], atol=1e-12)
+    np.testing.assert_allclose(told.covariance[0], np.cov(belief.state[0].T, aweights=belief.weight[0], bias=True))
+    np.testing.assert_allclose(told.kind[0, 1], belief.weight[0] @ belief.kind[0], atol=1e-12)
+
+
+def test_each_scan_has_random_numbers_of_its_own_and_is_remembered() -> None:
+    once, again, other = (lmb_particles.step(LINE, two_clouds(), LOOK, k, EVERYTHING, 0)[0] for k in (0, 0, 1))
+    np.testing.assert_array_equal(once.state, again.state)
+    assert np.all(once.state != other.state)
+    assert once.past == (LOOK,)
+    then, _ = lmb_particles.step(LINE, once, LOOK._replace(time=0.5), 1, EVERYTHING, 0)
+    assert [scan.time for scan in then.past] == [0.4, 0.5]
+
+
+@pytest.mark.parametrize("wrong", [{"clutter": math.nan}, {"detection": (math.nan, 0.5)}])
+def test_no_nan_of_a_model_passes(wrong: Any) -> None:
+    belief = lmb_particles.nobody(2, 400) if "clutter" in wrong else two_clouds()
+    with pytest.raises(FloatingPointError, match=r"the update by sensor 'line' at 0.4 s made a NaN"):
+        lmb_particles.step(Line(**wrong), belief, LOOK, 0, EVERYTHING, 0)
+
+
+class HoleAhead(Line):
+    """Detection is NaN a little off where an object is expected."""
+
+    def view(self, scan: LineScan, objects: Bernoullis, more: Components) -> View:
+        found = super().view(scan, objects, more)
+        return found._replace(detection=np.where(found.predicted[:, 0] > 1.0, math.nan, found.detection))
+
+
+def test_no_nan_of_what_is_drawn_passes() -> None:
+    belief = certain(np.zeros(2), np.zeros(2), 100, 0)
+    with pytest.raises(FloatingPointError, match=r"the update by sensor 'line' at 0.4 s made a NaN"):
+        lmb_particles.step(HoleAhead(noise=(10.0, 10.0)), belief, scan_at(0.4, ()), 0, lmb_particles.Knobs(100), 0)

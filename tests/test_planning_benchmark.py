@@ -40,6 +40,7 @@ PROMISED = {
     "unclear_share": "",
     "goal_share": "",
     "cycle_ms": "",
+    "cycle_p99_ms": "",
     "consistency_p95_m": "<= 1e-09",
     "consistency_noisy_lead_m": "",
     "chance_stated": "",
@@ -90,13 +91,14 @@ def test_timed_candidates_are_all_judged_and_wide_limits_turn_none_down() -> Non
 def test_drives_are_counted_together(monkeypatch: pytest.MonkeyPatch) -> None:
     one = dict.fromkeys(("collisions_at_fault", "stops_passed"), 0.0) | {"collisions": 1.0, "limit_violations": 3.0}
     one |= {"emergency": 0.5, "cycle_median_ms": 8.0, "cycles": 10.0, "stop_error_m": 0.1, "unclear": 0.6}
-    one["goal_reached"] = 1.0
+    one |= {"goal_reached": 1.0, "cycle_p99_ms": 30.0}
     other = one | {
         "collisions_at_fault": 2.0,
         "emergency": 0.0,
         "cycles": 30.0,
         "stop_error_m": 0.05,
         "goal_reached": 0.0,
+        "cycle_p99_ms": 40.0,
     }
     monkeypatch.setattr(planning_drives, "scores", lambda effort: {"follow": one, "recorded": other})
     found = planning_drives.closed_loops(TINY)
@@ -104,7 +106,7 @@ def test_drives_are_counted_together(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told == {
         "collisions_at_fault": 2.0, "collisions": 2.0, "limit_violations": 6.0, "stops_passed": 0.0,
         "stop_error_m": 0.1, "gap_error_m": None, "emergency_share": 0.125, "unclear_share": 0.6, "cycle_ms": 8.0,
-        "goal_share": 0.5,
+        "goal_share": 0.5, "cycle_p99_ms": 40.0,
     }  # fmt: skip
     assert "recorded 2" in found["collisions_at_fault"].detail and "follow" in found["stop_error_m"].detail
     assert found["goal_share"].detail == "of 2; not recorded"

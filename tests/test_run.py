@@ -64,6 +64,12 @@ def test_scores_are_explained_by_the_docstrings_of_their_metrics() -> None:
     assert meanings(["gospa_m"], ["experiments.view_metrics"]) == {"gospa_m": "GOSPA distance of the positions"}
 
 
+def test_a_meaning_of_two_lines_is_told_whole() -> None:
+    cycles = meanings(["cycle_median_ms", "cycle_p99_ms"], ["experiments.closed_loop_metrics"])
+    assert cycles["cycle_median_ms"].endswith("which compiles, and without building problems of optimal control")
+    assert cycles["cycle_p99_ms"] == "99 % of cycles take less"
+
+
 def test_the_arms_of_tracks_without_truth_are_told(launch: Command) -> None:
     csv_tracks.write("tracks.csv", protocol(0).data)
     words = ["engine.num_steps=200", "engine.warmup=100", "engine.thin=1", "engine.polish=false"]

@@ -204,7 +204,7 @@ def guarded(work: Callable[[], object]) -> int:
 
 def check_names() -> None:
     """Raise ConfigError where a folder of the user's hides one of our packages."""
-    for name in ("models", "inference", "experiments", "configs"):
+    for name in ("models", "inference", "planning", "experiments", "configs"):
         spec = importlib.util.find_spec(name)
         places = list(spec.submodule_search_locations or []) if spec else []
         if Path(places[0] if places else ".").resolve() != ROOT / name:

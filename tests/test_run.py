@@ -239,6 +239,14 @@ def test_a_folder_that_hides_our_packages_is_named(launch: Command) -> None:
     assert "the package 'configs'" in done.stderr and "hides it" in done.stderr
 
 
+def test_a_folder_that_hides_the_planner_is_named(launch: Command) -> None:
+    Path("planning").mkdir()
+    Path("planning/__init__.py").touch()
+    done = launch(module="experiments.drive")
+    assert done.returncode == 2
+    assert "the package 'planning'" in done.stderr and "hides it" in done.stderr
+
+
 def test_a_scenario_that_does_not_fit_the_model_is_refused() -> None:
     with pytest.raises(InputError, match="ConjugateGaussian reads Readings, but the scenario gives Markings"):
         run(slot_road, ConjugateGaussian(), lambda *_, seed: None)  # type: ignore[arg-type,return-value]

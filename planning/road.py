@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -158,7 +159,7 @@ def read_route(path: str | Path) -> tuple[int, ...]:
         words = Path(path).read_text().replace(",", " ").split()
     except (OSError, UnicodeDecodeError) as absent:
         raise InputError(f"route file {path} cannot be read: {absent}") from absent
-    if wrong := [word for word in words if not word.lstrip("-").isdigit()]:
+    if wrong := [word for word in words if not re.fullmatch(r"-?[0-9]{1,18}", word)]:
         raise InputError(f"route file {path} has '{wrong[0]}' where a lane id should be; write integers only")
     if not words:
         raise InputError(f"route file {path} is empty; write lane ids in driving order")

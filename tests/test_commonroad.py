@@ -305,6 +305,9 @@ def test_a_route_file_is_driven_along(write: Any, tmp_path: Path) -> None:
     assert 3 in commonroad(write(OLD), route=str(way), duration=5.0).route
     for text, sentence in (
         ("1 two", "has 'two' where a lane id should be"),
+        ("1 --2", "has '--2' where"),
+        ("1 \u00b2", "has '\u00b2' where"),
+        ("1" * 5000, "where a lane id should be"),
         ("", "is empty"),
         ("1 9", "names lane 9, which is none that a car may drive on"),
         ("3 2", "lane 2 neither follows lane 3 nor lies beside it"),

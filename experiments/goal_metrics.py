@@ -1,9 +1,9 @@
 """Whether a drive reached the goal of its scenario (info of experiments.scenarios.commonroad_drive), by its middle.
 
-goal_reached      1 where, at some look of the loop, place, time, speed and heading were all as asked for
-goal_place        1 where the place was ever reached
-goal_place_s      when that was first so
-goal_distance_m   least distance from the place
+goal_reached     1 where, at some look of the loop, place, time, speed and heading were all as asked for
+goal_place       1 where the place was ever reached
+goal_place_s     when that was first so
+goal_distance_m  least distance from the place
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,6 +30,7 @@ ELLIPSE = float(np.sqrt(-2.0 * np.log(0.1)))  # standard deviations about 90 % o
 CIRCLE = np.stack([f(np.linspace(0.0, 2 * np.pi, 40)) for f in (np.cos, np.sin)])  # (2, 40)
 CORNERS = 0.5 * np.array([[1, 1, -1, -1], [1, -1, -1, 1]], dtype=np.float64)  # (2, 4)
 UNSURE, TRUE, CLUTTER = "#8a8f98", "#111111", "#b4bac1"
+PAPER = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.0}  # behind words, which things may pass
 
 
 @dataclass(frozen=True)
@@ -93,9 +94,10 @@ class Animation:
             true = times_of(self.truth, self.tracks.time[t : t + 1])[0]
             outline_truth(axes, self.truth, slice(self.truth.offset[true], self.truth.offset[true + 1]))
         outline_tracks(axes, self.tracks, t, self.colour)
-        axes.text(0.02, 0.98, f"{now:.2f} s  {sensor}", transform=axes.transAxes, va="top", fontsize=9, color=TRUE)
+        corner: dict[str, Any] = {"transform": axes.transAxes, "bbox": PAPER, "zorder": 9}
+        axes.text(0.02, 0.98, f"{now:.2f} s  {sensor}", va="top", fontsize=9, color=TRUE, **corner)
         key = "x measurement   shaded: 90 %" if self.truth is None else "black: true   x measurement   shaded: 90 %"
-        axes.text(0.98, 0.02, key, transform=axes.transAxes, ha="right", fontsize=7, color=UNSURE)
+        axes.text(0.98, 0.02, key, ha="right", fontsize=7, color=UNSURE, **corner)
         scale(axes)
 
 

@@ -133,7 +133,7 @@ def meanings(scores: Iterable[str], modules: Iterable[str]) -> dict[str, str]:
 
 def _meaning(name: str, text: str) -> str:
     """Empty where no line tells it."""
-    if not (found := re.search(rf"^( +{re.escape(name)}  +)(\S.*)\n", text, re.MULTILINE)):
+    if not (found := re.search(rf"^( *{re.escape(name)}  +)(\S.*)\n", text, re.MULTILINE)):
         return ""
     more = re.match(rf"(?: {{{len(found[1])}}} *\S.*\n)*", text[found.end() :])
     return " ".join([found[2], *(more[0] if more else "").split()])

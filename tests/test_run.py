@@ -68,6 +68,9 @@ def test_a_meaning_of_two_lines_is_told_whole() -> None:
     cycles = meanings(["cycle_median_ms", "cycle_p99_ms"], ["experiments.closed_loop_metrics"])
     assert cycles["cycle_median_ms"].endswith("which compiles, and without building problems of optimal control")
     assert cycles["cycle_p99_ms"] == "99 % of cycles take less"
+    assert meanings(["goal_distance_m"], ["experiments.goal_metrics"]) == {
+        "goal_distance_m": "least distance from the place"
+    }
 
 
 def test_the_arms_of_tracks_without_truth_are_told(launch: Command) -> None:

@@ -432,6 +432,9 @@ def test_a_drive_by_command_is_stored_whole_and_not_repeated(launch: Command) ->
         ("drive", ["seed=-1"], "seed is -1; choose 0 or more"),
         ("drive", ["experiment=demo"], "experiment=demo chooses a model, which this command has not"),
         ("run", ["experiment=commonroad"], "experiment=commonroad chooses a planner, which this command has not"),
+        ("drive", ["engine=lmb"], "this command has no engine"),
+        ("run", ["driver=by_the_rules"], "this command has no driver"),
+        ("drive", ["scenario=drive_box", "scenario.distance=-5"], "distance is -5.0 m"),
         ("run", ["scenario=drive_box"], "`python -m experiments.drive` drives it"),
     ],
 )

@@ -145,6 +145,14 @@ def test_bad_input_is_one_sentence_and_leaves_nothing(launch: Command) -> None:
     assert not list(Path("runs").iterdir())
 
 
+def test_a_config_that_is_no_yaml_is_one_sentence(launch: Command) -> None:
+    Path("conf/experiment").mkdir()
+    Path("conf/experiment/broken.yaml").write_text("a: [1,\n")
+    done = launch("--config-dir", "conf", "experiment=broken")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert "a config file cannot be read" in done.stderr and "broken.yaml" in done.stderr and "line 2" in done.stderr
+
+
 def test_a_failed_job_does_not_stop_the_sweep(launch: Command) -> None:
     words = [*FAKE, "engine.fail_at=100", "engine.num_draws=100,200", "seed=0,1"]
     done = launch("-m", *words)

@@ -62,15 +62,18 @@ class Animation:
         shown = np.unique(np.linspace(0, len(self.tracks.time) - 1, self.frames).round().astype(int))
         low, high = self.corners()
         width, height = (high - low)[0]
-        size = INCHES * np.array([width, height]) / max(width, height)
-        figure = Figure(figsize=tuple(np.maximum(size, 0.4 * INCHES)), dpi=dpi)
+        inch = max(width, height) / INCHES
+        size = np.maximum(np.array([width, height]) / inch, 0.4 * INCHES)
+        spare = (size * inch - [width, height]) / 2  # a flat scene has room above and below
+        low, high = low - spare, high + spare
+        figure = Figure(figsize=tuple(size), dpi=dpi)
         axes = figure.add_axes((0.004, 0.004, 0.992, 0.992))
         writer = PillowWriter(fps=PER_SECOND)
         with writer.saving(figure, str(file), dpi), Progress("drawing", len(shown)) as bar:
             for t in shown:
                 axes.clear()
                 axes.set(xlim=(low[t, 0], high[t, 0]), ylim=(low[t, 1], high[t, 1]), xticks=[], yticks=[])
-                axes.set_aspect("equal", adjustable="datalim")
+                axes.set_aspect("equal")
                 axes.spines[:].set_color(CLUTTER)
                 self.draw(axes, int(t))
                 writer.grab_frame()

@@ -402,7 +402,7 @@ def test_reasons_of_one_colour_are_one_entry_of_the_legend() -> None:
 
 def test_who_is_passed_is_told(driven: dict[str, Drive]) -> None:
     words = driven["parked_car, nobody comes"].log.words
-    assert words[0] == "keep" and "keep; passing 0" in words.tolist()
+    assert words[0] == "keep" and "keep; passing road user 0" in words.tolist()
 
 
 def test_a_drive_by_command_is_stored_whole_and_not_repeated(launch: Command) -> None:

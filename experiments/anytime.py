@@ -83,7 +83,7 @@ def sweep(job: Job, engine: str, num: int) -> Outcomes:
     import numpy as np
 
     from experiments.anytime_rates import Outcomes, outcomes
-    from experiments.run import check_reads
+    from experiments.run import check_read, check_reads
 
     file = job.folder.parent / f"anytime-{job.name}-{num}" / "outcomes.npz"
     if file.is_file() and not job.force:
@@ -94,7 +94,9 @@ def sweep(job: Job, engine: str, num: int) -> Outcomes:
     if "progress" in run.keywords:
         run = partial(run, progress=False)  # the bar of the sweep is the one
     scenario = job.config["scenario"]
-    check_reads(model, build(scenario, "scenario").data)
+    scene = build(scenario, "scenario")
+    check_read(scene)
+    check_reads(model, scene.data)
     scenes = (build(scenario | {"seed": seed}, "scenario") for seed in range(num))
     found = outcomes(run, model, scenes, num, f"anytime, {engine}", show=True)
     with store.writing(file.parent) as folder:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.scenarios.driving import Body, DriveScene, observe
+from experiments.scenarios.driving import Body, DriveScene, check, observe
 from models.program import InputError
 from planning.control import Command, Control, Lags, command, moved
 from planning.frenet import FrenetState, Pose, to_frenet, to_pose
@@ -62,7 +62,7 @@ class Loop:
 
 
 def _multiple(name: str, long: float, of: str, short: float) -> None:
-    if abs(long / short - round(long / short)) > 1e-9:
+    if not math.isfinite(long / short) or abs(long / short - round(long / short)) > 1e-9:
         raise InputError(f"loop: {name} is {long} s, but must be a multiple of {of}, {short} s")
 
 
@@ -140,15 +140,22 @@ def drive(
 ) -> Drive:
     """Drive through a scene.
 
-    Raises InputError for a scene that cannot be begun (a route that is none, a vehicle off it, no time to drive), and
-    for time steps that do not fit into one another."""
+    Raises InputError for a scene that cannot be begun (a route that is none, a vehicle off it, no time to drive), for
+    a driver that is none, and for time steps that do not fit into one another."""
+    check(scene)
     cycle = planner.fans.cycle
     if not cycle <= scene.duration < math.inf:
         raise InputError(f"scene {scene.name}: duration is {scene.duration} s, but must be a cycle, {cycle} s, or more")
     _multiple("cycle", cycle, "world", loop.world)
     _multiple("cycle", cycle, "planner.step", planner.step)
+    if not planner.horizon > cycle:
+        raise InputError(f"planner: horizon is {planner.horizon} s, but must be longer than a cycle, {cycle} s")
+    if seed < 0:
+        raise InputError(f"seed is {seed}, but must be 0 or more")
     way = route(scene.lanes, scene.route)
     think = mind(scene, way, planner)
+    if not callable(think):
+        raise InputError(f"the driver gave a {type(think).__name__}; return a mind, (time, state, tracks) -> Thought")
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     others: list[Pose | None] = [None] * len(scene.actors)
     others = _others(scene, planner.vehicle, 0.0, 0.0, others, scene.ego)
@@ -199,6 +206,9 @@ def _thought(found: Any) -> Thought:
     """What a driver made of a cycle. Raises InputError where it is something else."""
     if not isinstance(found, Thought):
         raise InputError(f"the driver answered with a {type(found).__name__}; return experiments.closed_loop.Thought")
+    if not isinstance(found.given, PlanScene):
+        given = type(found.given).__name__
+        raise InputError(f"the driver would have a {given} planned in; give planning.planner.Scene in its Thought")
     return found
 
 

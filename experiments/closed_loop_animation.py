@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.closed_loop import Drive
 from experiments.closed_loop_figures import BAD, GOOD, INK, KERB, OTHER, PLAN, REST, draw_cycle, fan_of
-from experiments.tracking_animation import scale
+from experiments.tracking_animation import PAPER, scale
 from inference.progress import Progress
 
 INCHES = (7.2, 3.56)
@@ -62,7 +62,8 @@ class Animation:
         axes.set(xticks=[], yticks=[])
         speed = log.planned[number, 0, 3]
         told = f"{log.cycle[number]:.1f} s   {speed:.1f} m/s   {log.tier[number]}"
-        axes.text(0.015, 0.975, told, transform=axes.transAxes, va="top", fontsize=9, color=INK, zorder=9)
+        corner: dict[str, Any] = {"transform": axes.transAxes, "bbox": PAPER, "zorder": 9}
+        axes.text(0.015, 0.975, told, va="top", fontsize=9, color=INK, **corner)
         scale(axes)
 
 

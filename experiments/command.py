@@ -24,6 +24,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from yaml import YAMLError
 
 from experiments.schema import UnknownKnob, check_switch, check_values, expand, suggest
 from experiments.signatures import ConfigError
@@ -31,6 +32,7 @@ from experiments.store import check_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHER_COMMAND = re.compile(r"In '(\w+)/(\w+)': Could not override '/?(\w+)'\. No match")
+OTHER_PART = re.compile(r"Could not override '(model|engine|driver|planner)'\. No match")
 
 
 class SchemaLoader(ConfigLoaderImpl):
@@ -112,6 +114,11 @@ def in_words(error: BaseException) -> str | None:
             f"{group}={name} chooses a {part}, which this command has not: it is of another one "
             "(`waybayes` runs, `python -m experiments.drive` drives)"
         )
+    if (part := OTHER_PART.match(str(error))) is not None and isinstance(error, HydraException):
+        return (
+            f"this command has no {part[1]}: `waybayes` runs a scenario, a model and an engine, "
+            "`python -m experiments.drive` a scenario, a driver and a planner"
+        )
     if isinstance(error, HydraException | OmegaConfBaseException):
         causes: list[BaseException] = [error]
         while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
@@ -123,6 +130,8 @@ def in_words(error: BaseException) -> str | None:
         if typed is not None:
             return f"{typed.full_key}: {_first_line(typed)}"
         return " ".join(str(causes[0]).split()) or " ".join(str(causes[-1]).split())
+    if isinstance(error, YAMLError):
+        return f"a config file cannot be read: {' '.join(str(error).split())}; mend its YAML"
     program = sys.modules.get("models.program")  # where it was never imported, nobody raised its InputError
     kinds = (ConfigError, program.InputError) if program else (ConfigError,)
     return str(error) if isinstance(error, kinds) else None
@@ -130,6 +139,8 @@ def in_words(error: BaseException) -> str | None:
 
 def _first_line(error: Any) -> str:
     text = str(error).partition("\n")[0]
+    if text.startswith("Invalid value assigned") and "is not a ListConfig" in text:
+        return f"it is a list; write {error.full_key}=[...], quoted for the shell"
     return text.replace("$VALUE_TYPE", type(error.value).__name__).replace("$VALUE", str(error.value))
 
 
@@ -204,7 +215,7 @@ def guarded(work: Callable[[], object]) -> int:
 
 def check_names() -> None:
     """Raise ConfigError where a folder of the user's hides one of our packages."""
-    for name in ("models", "inference", "experiments", "configs"):
+    for name in ("models", "inference", "planning", "experiments", "configs"):
         spec = importlib.util.find_spec(name)
         places = list(spec.submodule_search_locations or []) if spec else []
         if Path(places[0] if places else ".").resolve() != ROOT / name:

@@ -102,6 +102,8 @@ def plan(words: list[str], usual: tuple[str, ...] = USUAL) -> Plan:
         if key in ("engines", "engine"):
             if engines:
                 raise ConfigError(f"engines are named twice, the second time by {word}; give one list")
+            if override.is_sweep_override():
+                raise ConfigError(f"{word} is no list; write '{key}=[{word.partition('=')[2]}]', quoted")
             engines = [str(name) for name in (value if isinstance(value, list) else [value])]
             if not engines:
                 raise ConfigError(f"{key} is empty; name one or more, such as {key}=[rjmcmc,least_squares]")

@@ -23,7 +23,10 @@ def by_the_rules(
     rules: Rules = Rules(),
     manners: Manners = Manners(),
 ) -> Mind:
-    """A mind for one drive (experiments.closed_loop.drive); boundary lines of the scene are seen from the beginning."""
+    """A mind for one drive (experiments.closed_loop.drive); boundary lines of the scene are seen from the beginning.
+
+    Its words begin with the goal: keep a speed, follow who is ahead, stop before a line, merge into a gap. Then whom it
+    passes, by the place among the scene's actors, and why each stop point may be passed or not."""
     roads = network(scene.lanes)
     times = [planner.step * (k + 1) for k in range(planner.num_steps)]
     decided, behaved = Decided(), Memory()
@@ -51,7 +54,7 @@ def by_the_rules(
             lines=scene.boundary,
         )
         decided = permissions.memory
-        passing = [f"passing {behaved.passing.blocker}"] if behaved.passing.going else []
+        passing = [f"passing road user {behaved.passing.blocker}"] if behaved.passing.going else []
         why = [f"{name}: {reason}" for name, reason in permissions.reasons.items()]
         return Thought(given, "; ".join([behaved.goal, *passing, *why]))
 

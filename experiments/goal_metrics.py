@@ -1,9 +1,9 @@
 """Whether a drive reached the goal of its scenario (info of experiments.scenarios.commonroad_drive), by its middle.
 
-goal_reached      1 where, at some look of the loop, place, time, speed and heading were all as asked for
-goal_place        1 where the place was ever reached
-goal_place_s      when that was first so
-goal_distance_m   least distance from the place
+goal_reached     1 where, at some look of the loop, place, time, speed and heading were all as asked for
+goal_place       1 where the place was ever reached
+goal_time_s      when that was first so
+goal_distance_m  least distance from the place
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def goals(drive: Drive) -> dict[str, float]:
     met = np.stack([(d <= 0.0) & asked(goal, ego, time) for goal, d in zip(told, apart, strict=True)])
     at_place = (apart <= 0.0).any(0)
     out = {"goal_reached": float(met.any()), "goal_place": float(at_place.any()), "goal_distance_m": float(apart.min())}
-    return out | ({"goal_place_s": float(time[at_place.argmax()])} if at_place.any() else {})
+    return out | ({"goal_time_s": float(time[at_place.argmax()])} if at_place.any() else {})
 
 
 def distance(goal: Mapping[str, Any], ego: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -36,7 +36,16 @@ def metrics(
 ) -> dict[str, float]:
     """experiments.kitti_evaluation of the boxes that the filter reports, and the median time of a frame [ms]. What
     labels teach (experiments.kitti_folds) is learnt on all other sequences that are there: the filter `follow` runs on
-    each of them. Nothing without tracks of a sequence of KITTI."""
+    each of them. Nothing without tracks of a sequence of KITTI.
+
+    kitti_mota          1 - (missed + false + switches) / labels (CLEAR), of the boxes that are reported
+    kitti_hota          higher order tracking accuracy (trackeval)
+    kitti_idf1          F1 of detections whose identity is right (trackeval)
+    kitti_ids           switches: labels paired with another track than in the frame before
+    kitti_frag          fragmentations: labels whose track changes or comes back
+    kitti_recall        share of the labels with a box
+    kitti_precision     share of the boxes with a label
+    kitti_ms_per_frame  median time of the filter [ms]"""
     if not isinstance(posterior, Tracks) or not isinstance(scene.truth, KittiTruth):
         return {}
     own = scene.truth.sequence

@@ -32,7 +32,7 @@ from omegaconf import open_dict
 
 from experiments import store
 from experiments.command import guarded, in_words
-from experiments.run import check_reads, engine_seed, job_of
+from experiments.run import check_read, check_reads, engine_seed, job_of
 from experiments.signatures import ConfigError
 
 if TYPE_CHECKING:
@@ -189,6 +189,7 @@ def run(task: Task, say: Callable[[str], None] = print) -> None:
         engine.keywords["progress"] = False
     scenes, others = ([build(scene, "scenario") for scene in each] for each in (task.scenes, task.held_out))
     for scene in scenes[:1]:
+        check_read(scene)
         check_reads(model, scene.data)
     say(f"scenes     {len(scenes)} to learn from, {len(others)} held out")
     data, knobs = [scene.data for scene in scenes], task.knobs

@@ -124,12 +124,19 @@ def scores_table(scores: dict[str, float], metrics: list[dict[str, Any]]) -> str
 
 
 def meanings(scores: Iterable[str], modules: Iterable[str]) -> dict[str, str]:
-    """What docstrings of the metrics' modules say of scores, in lines 'name  meaning'; then those of modules of
-    experiments that they speak of."""
+    """What docstrings of the metrics' modules say of scores, in lines 'name  meaning' that may go on below the meaning;
+    then those of modules of experiments that they speak of."""
     own = "\n".join(_texts(modules))
     text = "\n".join([own, *_texts(re.findall(r"\bexperiments\.\w+", own))])
-    lines = {name: re.search(rf"^ +{re.escape(name)}  +(\S.*)$", text, re.MULTILINE) for name in scores}
-    return {name: line[1] for name, line in lines.items() if line}
+    return {name: meaning for name in scores if (meaning := _meaning(name, text))}
+
+
+def _meaning(name: str, text: str) -> str:
+    """Empty where no line tells it."""
+    if not (found := re.search(rf"^( *{re.escape(name)}  +)(\S.*)\n", text, re.MULTILINE)):
+        return ""
+    more = re.match(rf"(?: {{{len(found[1])}}} *\S.*\n)*", text[found.end() :])
+    return " ".join([found[2], *(more[0] if more else "").split()])
 
 
 def _texts(modules: Iterable[str]) -> list[str]:

@@ -141,6 +141,7 @@ def evidence_of(model: Any, scene: Scene) -> Any:
     """What a model makes of a scene. Raises InputError where they do not fit, and for a program that does not run."""
     from models.program import check
 
+    check_read(scene)
     check_reads(model, scene.data)
     evidence = model.prepare(scene.data) if hasattr(model, "prepare") else scene.data
     check(model, evidence)

@@ -99,9 +99,12 @@ def writing(folder: Path) -> Iterator[Path]:
 
 
 def is_done(folder: Path) -> bool:
-    """Whether a folder holds a completed run, nothing failed in it."""
+    """Whether a folder holds a completed run, nothing failed in it; one whose manifest is damaged does not."""
     file = folder / "manifest.json"
-    return file.is_file() and not read_json(file).get("failures")
+    try:
+        return file.is_file() and not dict(read_json(file)).get("failures")
+    except (ValueError, TypeError):
+        return False
 
 
 def manifest(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,6 +30,7 @@ ELLIPSE = float(np.sqrt(-2.0 * np.log(0.1)))  # standard deviations about 90 % o
 CIRCLE = np.stack([f(np.linspace(0.0, 2 * np.pi, 40)) for f in (np.cos, np.sin)])  # (2, 40)
 CORNERS = 0.5 * np.array([[1, 1, -1, -1], [1, -1, -1, 1]], dtype=np.float64)  # (2, 4)
 UNSURE, TRUE, CLUTTER = "#8a8f98", "#111111", "#b4bac1"
+PAPER = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.0}  # behind words, which things may pass
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,18 @@ class Animation:
         shown = np.unique(np.linspace(0, len(self.tracks.time) - 1, self.frames).round().astype(int))
         low, high = self.corners()
         width, height = (high - low)[0]
-        size = INCHES * np.array([width, height]) / max(width, height)
-        figure = Figure(figsize=tuple(np.maximum(size, 0.4 * INCHES)), dpi=dpi)
+        inch = max(width, height) / INCHES
+        size = np.maximum(np.array([width, height]) / inch, 0.4 * INCHES)
+        spare = (size * inch - [width, height]) / 2  # a flat scene has room above and below
+        low, high = low - spare, high + spare
+        figure = Figure(figsize=tuple(size), dpi=dpi)
         axes = figure.add_axes((0.004, 0.004, 0.992, 0.992))
         writer = PillowWriter(fps=PER_SECOND)
         with writer.saving(figure, str(file), dpi), Progress("drawing", len(shown)) as bar:
             for t in shown:
                 axes.clear()
                 axes.set(xlim=(low[t, 0], high[t, 0]), ylim=(low[t, 1], high[t, 1]), xticks=[], yticks=[])
-                axes.set_aspect("equal", adjustable="datalim")
+                axes.set_aspect("equal")
                 axes.spines[:].set_color(CLUTTER)
                 self.draw(axes, int(t))
                 writer.grab_frame()
@@ -93,9 +97,10 @@ class Animation:
             true = times_of(self.truth, self.tracks.time[t : t + 1])[0]
             outline_truth(axes, self.truth, slice(self.truth.offset[true], self.truth.offset[true + 1]))
         outline_tracks(axes, self.tracks, t, self.colour)
-        axes.text(0.02, 0.98, f"{now:.2f} s  {sensor}", transform=axes.transAxes, va="top", fontsize=9, color=TRUE)
+        corner: dict[str, Any] = {"transform": axes.transAxes, "bbox": PAPER, "zorder": 9}
+        axes.text(0.02, 0.98, f"{now:.2f} s  {sensor}", va="top", fontsize=9, color=TRUE, **corner)
         key = "x measurement   shaded: 90 %" if self.truth is None else "black: true   x measurement   shaded: 90 %"
-        axes.text(0.98, 0.02, key, transform=axes.transAxes, ha="right", fontsize=7, color=UNSURE)
+        axes.text(0.98, 0.02, key, ha="right", fontsize=7, color=UNSURE, **corner)
         scale(axes)
 
 

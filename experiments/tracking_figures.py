@@ -158,7 +158,7 @@ def over_time(
             existence.plot(tracks.time, sure, lw=1.2, color=colour[label])
             existence.plot(tracks.time[alone(sure)], sure[alone(sure)], ".", ms=4, mew=0, color=colour[label])
     above = existence.axhline(threshold, color=TRACK, lw=0.8, ls=":", label="a track above this")
-    existence.legend(handles=[above], frameon=False, fontsize=8, loc="lower right")
+    existence.legend(handles=[above], frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     existence.set(ylim=(-0.03, 1.05), ylabel="existence")
     low, high = (tracks.count_quantile(q) for q in BAND)
     count.fill_between(tracks.time, low, high, step="mid", color=ESTIMATE, alpha=0.25, lw=0, label="90 % band")

@@ -19,6 +19,7 @@ from models.program import InputError
 Floats = NDArray[np.float64]
 STEP = 0.25  # of the table [m]: cubic interpolation then errs by less than 1e-6 m up to curvatures of .2 / m
 FEWEST = 3  # points that make a line
+LONGEST = 2e5  # that a line is [m]
 FINE = 0.05  # of the points at which arc length is told from chord length [m]
 
 
@@ -94,13 +95,16 @@ def from_points(points: ArrayLike, *, std: float = 0.05, name: str = "reference 
     """A smooth line along points (N, 2) whose errors have standard deviation `std` [m].
 
     A quintic smoothing spline in chord length: curvature and its slope are continuous; x'' jumps nowhere.
-    Raises InputError, with `name`: fewer than three points, NaN, points that repeat, a line that crosses itself."""
+    Raises InputError, with `name`: fewer than three points, NaN, points that repeat, a line that is too long or crosses
+    itself."""
     from scipy.integrate import cumulative_simpson
     from scipy.interpolate import CubicHermiteSpline, make_splprep
 
     given = np.asarray(points, float)
     _check(given, std, name)
     chord = np.r_[0.0, np.cumsum(np.hypot(*np.diff(given, axis=0).T))]
+    if chord[-1] > LONGEST:
+        raise InputError(f"{name}: it is {chord[-1]:g} m long, more than {LONGEST:g} m; take what is near")
     degree = min(5, len(given) - 1)
     curve, _ = make_splprep(given.T, u=chord, k=degree, s=len(given) * std**2)
     first, second = curve.derivative(1), curve.derivative(2)

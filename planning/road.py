@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -158,7 +159,7 @@ def read_route(path: str | Path) -> tuple[int, ...]:
         words = Path(path).read_text().replace(",", " ").split()
     except (OSError, UnicodeDecodeError) as absent:
         raise InputError(f"route file {path} cannot be read: {absent}") from absent
-    if wrong := [word for word in words if not word.lstrip("-").isdigit()]:
+    if wrong := [word for word in words if not re.fullmatch(r"-?[0-9]{1,18}", word)]:
         raise InputError(f"route file {path} has '{wrong[0]}' where a lane id should be; write integers only")
     if not words:
         raise InputError(f"route file {path} is empty; write lane ids in driving order")
@@ -168,13 +169,18 @@ def read_route(path: str | Path) -> tuple[int, ...]:
 def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
     """The route along lanes `ids`, each a successor of the one before.
 
-    Raises InputError for an unknown lane, lanes that do not follow one another, and none at all."""
-    if not ids:
-        raise InputError("the route has no lanes; name one or more")
+    Raises InputError for an unknown lane, lanes that do not follow one another, none at all, a speed limit that is no
+    positive number, and a left border to the right of the right one."""
+    if not isinstance(ids, Sequence) or not ids:
+        raise InputError(f"the route is {ids}; name one or more lanes")
     for a in ids:
         if a not in lanes:
-            known = ", ".join(map(str, list(lanes)[:8]))
-            raise InputError(f"the route names lane {a}, which the map has not; it has {known}, ...")
+            known = ", ".join(map(repr, list(lanes)[:8])) + (", ..." if len(lanes) > 8 else "")
+            raise InputError(f"the route names lane {a!r}, which the map has not; it has {known or 'none'}")
+        if not lanes[a].speed > 0.0:
+            raise InputError(
+                f"lane {a}: its speed limit is {lanes[a].speed}, but must be positive; infinity means none"
+            )
     for a, b in pairwise(ids):
         if b not in lanes[a].successors:
             raise InputError(f"lane {b} of the route does not follow lane {a}, which leads to {lanes[a].successors}")
@@ -196,6 +202,8 @@ def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
             (left if far_left is None else far_left, left, right, right if far_right is None else far_right)
         ):
             edges[here, column] = _offsets(line, border, grid[here])
+        if here.any() and np.median(edges[here, 1] - edges[here, 2]) < 0.0:
+            raise InputError(f"lane {a}: its left border lies to the right of its right one; exchange them")
     opposite = np.array([lanes[a].opposite for a in ids])[which]
     speed = np.array([lanes[a].speed for a in ids])
     joins = start[1:][[lanes[a].gives_way for a in ids[:-1]]]

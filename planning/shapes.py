@@ -182,6 +182,8 @@ def check_obstacles(obstacles: Obstacles, num_steps: int) -> None:
     for name, value in obstacles._asdict().items():
         if not isinstance(value, np.ndarray):
             raise InputError(f"obstacles: {name} is a {type(value).__name__}, but must be an array")
+        if value.dtype.kind not in "biuf":
+            raise InputError(f"obstacles: {name} is an array of {value.dtype}, but must be one of numbers")
     num = len(obstacles.pose)
     wanted = {
         "pose": (num, num_steps, 3),
@@ -231,9 +233,13 @@ class Boundary(NamedTuple):
 def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, float, float] | None = None) -> Boundary:
     """Of lines, each (N, 2) points [m]; `within` keeps what is nearer than r to (x, y): (x, y, r).
 
-    Raises InputError for NaN, wrong shapes, and lines that span more than MOST_CELLS cells."""
+    Raises InputError for NaN, wrong shapes, a reach below 0, and lines that span more than MOST_CELLS cells."""
     from planning.boundary_kernel import bucket
 
+    if not 0.0 <= reach < math.inf:
+        raise InputError(f"boundary lines: reach is {reach}, but must be 0 or more and finite [m]")
+    if within is not None and not np.isfinite(within).all():
+        raise InputError(f"boundary lines: within is {within}, but must be x, y and a radius, all finite [m]")
     parts = [np.zeros((0, 4))]
     for number, line in enumerate(lines):
         points = np.asarray(line, float)

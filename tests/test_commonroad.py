@@ -263,7 +263,7 @@ def test_the_made_scenario_is_driven_to_its_goal(write: Any) -> None:
     found = drive(scene, by_the_rules)
     told = metrics(found) | goals(found)
     assert (told["collisions"], told["limit_violations"], told["goal_reached"]) == (0.0, 0.0, 1.0)
-    assert told["goal_place_s"] == pytest.approx(12.5, abs=0.1), "(145 - 20) m at 10 m/s"
+    assert told["goal_time_s"] == pytest.approx(12.5, abs=0.1), "(145 - 20) m at 10 m/s"
     late = {**scene.info["goals"][0], "time": [0.0, 12.0]}
     missed = goals(found._replace(scene=scene._replace(info={"goals": [late]})))
     assert (missed["goal_reached"], missed["goal_place"], missed["goal_distance_m"]) == (0.0, 1.0, 0.0)
@@ -305,6 +305,9 @@ def test_a_route_file_is_driven_along(write: Any, tmp_path: Path) -> None:
     assert 3 in commonroad(write(OLD), route=str(way), duration=5.0).route
     for text, sentence in (
         ("1 two", "has 'two' where a lane id should be"),
+        ("1 --2", "has '--2' where"),
+        ("1 \u00b2", "has '\u00b2' where"),
+        ("1" * 5000, "where a lane id should be"),
         ("", "is empty"),
         ("1 9", "names lane 9, which is none that a car may drive on"),
         ("3 2", "lane 2 neither follows lane 3 nor lies beside it"),
@@ -315,6 +318,11 @@ def test_a_route_file_is_driven_along(write: Any, tmp_path: Path) -> None:
             commonroad(write(OLD), route=str(way))
     with pytest.raises(InputError, match="cannot be read"):
         commonroad(write(OLD), route=str(tmp_path / "none.txt"))
+
+
+def test_a_way_of_a_thousand_kilometres_is_refused(write: Any) -> None:
+    with pytest.raises(InputError, match=r"scenario.beyond is 1e\+06 m"):
+        commonroad(write(OLD), beyond=1e6)
 
 
 def test_headings_are_within_a_span_whatever_full_turns_lie_between() -> None:

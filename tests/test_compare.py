@@ -77,6 +77,10 @@ def test_a_scenario_that_the_model_does_not_read_is_told_once(launch: Command) -
     assert done.returncode == 2
     (sentence,) = done.stderr.splitlines()
     assert "model SlotRoad reads Markings, but the scenario gives Readings" in sentence
+    done = launch("scenario=drive_follow", "engines=[rjmcmc]", module="experiments.compare")
+    assert done.returncode == 2
+    (sentence,) = done.stderr.splitlines()
+    assert "scenario follow is one to drive in, not to learn from" in sentence
 
 
 @pytest.mark.parametrize(
@@ -86,6 +90,7 @@ def test_a_scenario_that_the_model_does_not_read_is_told_once(launch: Command) -
         (["engine=[]"], "engine is empty"),
         (["engine=[nuts]", "engines=[smc]"], "named twice"),
         (["engines=[nuts,smc,nuts]"], "names an engine twice"),
+        (["engines=nuts,smc"], r"is no list; write 'engines=\[nuts,smc\]'"),
         (["seeds=0"], "seeds is '0'"),
         (["seeds=two"], "seeds is 'two'"),
         (["scenes=0"], "scenes is '0'"),

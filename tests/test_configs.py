@@ -126,6 +126,10 @@ def test_a_config_shows_the_defaults_of_the_signature() -> None:
         ("force=5", "force is a switch, but is 5; give true or false"),
         ("engine.polish=1", "engine.polish is a switch, but is 1; give true or false"),
         ("models=gaussian", "a run has no key 'models'; did you mean 'model'?"),
+        (
+            "model.prior_std=three",
+            "model.prior_std: it is a list; write model.prior_std=[...], quoted for the shell",
+        ),
     ],
 )
 def test_a_mistake_is_one_sentence_with_a_suggestion(word: str, sentence: str) -> None:

@@ -205,6 +205,61 @@ def test_a_scene_that_cannot_be_begun_is_refused() -> None:
         drive(scene, steady(fails=(0.0, 1.0)))
     with pytest.raises(InputError, match=r"answered with a NoneType; return experiments.closed_loop.Thought"):
         drive(scene, lambda *given: lambda *seen: None)  # type: ignore[arg-type, return-value]
+    with pytest.raises(InputError, match=r"the driver gave a NoneType; return a mind"):
+        drive(scene, lambda *given: None)  # type: ignore[arg-type, return-value]
+    with pytest.raises(InputError, match=r"would have a NoneType planned in; give planning.planner.Scene"):
+        drive(scene, lambda *given: lambda *seen: Thought(None))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"horizon is 0.15 s, but must be longer than a cycle"):
+        drive(scene, steady(), Planner(horizon=0.15))
+    with pytest.raises(InputError, match="seed is -1"):
+        drive(scene, steady(), seed=-1)
+    with pytest.raises(InputError, match=r"world is 1e\+308 s, but must be a multiple"):
+        Loop(world=1e308)
+
+
+def test_a_scene_with_parts_that_cannot_be_is_refused_before_the_drive() -> None:
+    scene = driven_roads.stop_line()
+    first, lane = scene.stops[0], scene.lanes[1]
+    nan = math.nan
+    for wrong, sentence in (
+        (scene._replace(ego=scene.ego._replace(speed=-5.0)), "the vehicle's speed is -5.0 m/s"),
+        (scene._replace(wanted=nan), "the speed wanted is nan m/s"),
+        (scene._replace(actors=("car",)), "road user 0 is a str"),  # type: ignore[arg-type]
+        (scene._replace(stops=(first._replace(s=nan),)), "stop point first is from nan to"),
+        (
+            scene._replace(stops=(first._replace(zone=first.zone[:0]),)),
+            r"the zone of stop point first has shape \(0, 2",
+        ),
+        (scene._replace(lights={"last": ((0.0, "red"),)}), "the light 'last' is of no stop point"),
+        (scene._replace(lights={"first": ((1.0, "red"),)}), r"the light 'first' changes at \[1.0\] s"),
+        (
+            scene._replace(lights={"first": ((0.0, "rot"),)}),
+            "the light 'first' is 'rot' once, but must be one of green",
+        ),
+        (scene._replace(lanes={1: lane._replace(speed=nan)}), "lane 1: its speed limit is nan"),
+        (scene._replace(lanes={**scene.lanes, 1: lane._replace(left=lane.right, right=lane.left)}), "exchange them"),
+        (scene._replace(lanes={}), "which the map has not; it has none"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            drive(wrong, steady())
+
+
+def test_road_users_that_cannot_be_are_refused() -> None:
+    going = ((0.0, 5.0),)
+    for make, sentence in (
+        (lambda: Scripted(LINE, math.nan, going), "start is nan"),
+        (lambda: Scripted(LINE, 0.0, 5.0), "speed is 5.0, but must be"),  # type: ignore[arg-type]
+        (lambda: Scripted(LINE, 0.0, ()), "speed is"),
+        (lambda: Scripted(LINE, 0.0, ((3.0, 5.0), (1.0, 5.0))), "times of its speed must rise"),
+        (lambda: Scripted(LINE, 0.0, ((0.0, -5.0),)), "its speed is -5.0 m/s; give it a line that runs the other way"),
+        (lambda: Scripted(LINE, 0.0, going, ((0.0, math.nan),)), "offset is"),
+        (lambda: Scripted(LINE, 0.0, going, size=(4.0, 0.0)), "its size is"),
+        (lambda: Reacting(LINE, 0.0, 5.0, 0.0), "wanted is 0.0, but must be positive"),
+        (lambda: Reacting(LINE, 0.0, -5.0, 8.0), "speed is -5.0, but must be 0 or more"),
+        (lambda: Recorded(np.zeros(1), np.zeros((1, 5)), size=(-1.0, 2.0)), "its size is"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            make()
 
 
 def test_a_vehicle_off_its_plan_is_planned_from_where_it_is() -> None:
@@ -347,7 +402,7 @@ def test_reasons_of_one_colour_are_one_entry_of_the_legend() -> None:
 
 def test_who_is_passed_is_told(driven: dict[str, Drive]) -> None:
     words = driven["parked_car, nobody comes"].log.words
-    assert words[0] == "keep" and "keep; passing 0" in words.tolist()
+    assert words[0] == "keep" and "keep; passing road user 0" in words.tolist()
 
 
 def test_a_drive_by_command_is_stored_whole_and_not_repeated(launch: Command) -> None:
@@ -377,6 +432,9 @@ def test_a_drive_by_command_is_stored_whole_and_not_repeated(launch: Command) ->
         ("drive", ["seed=-1"], "seed is -1; choose 0 or more"),
         ("drive", ["experiment=demo"], "experiment=demo chooses a model, which this command has not"),
         ("run", ["experiment=commonroad"], "experiment=commonroad chooses a planner, which this command has not"),
+        ("drive", ["engine=lmb"], "this command has no engine"),
+        ("run", ["driver=by_the_rules"], "this command has no driver"),
+        ("drive", ["scenario=drive_box", "scenario.distance=-5"], "distance is -5.0 m"),
         ("run", ["scenario=drive_box"], "`python -m experiments.drive` drives it"),
     ],
 )

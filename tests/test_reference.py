@@ -126,6 +126,7 @@ def test_points_at_the_curvature_centre_and_beyond_the_ends_are_refused() -> Non
         ([(0.0, 0.0), (1.0, math.nan), (2.0, 0.0)], "point 1 is"),
         ([(0.0, 0.0), (1.0, 0.0), (1.0, 0.0), (2.0, 0.0)], "points 1 and 2 are the same"),
         (circle(10.0, 7.0), "crosses itself"),
+        ([(0.0, 0.0), (1e9, 0.0), (2e9, 0.0)], "is 2e+09 m long"),
         ([0.0, 1.0, 2.0], "must be (N, 2)"),
     ],
 )

@@ -64,6 +64,15 @@ def test_scores_are_explained_by_the_docstrings_of_their_metrics() -> None:
     assert meanings(["gospa_m"], ["experiments.view_metrics"]) == {"gospa_m": "GOSPA distance of the positions"}
 
 
+def test_a_meaning_of_two_lines_is_told_whole() -> None:
+    cycles = meanings(["cycle_median_ms", "cycle_p99_ms"], ["experiments.closed_loop_metrics"])
+    assert cycles["cycle_median_ms"].endswith("which compiles, and without building problems of optimal control")
+    assert cycles["cycle_p99_ms"] == "99 % of cycles take less"
+    assert meanings(["goal_distance_m"], ["experiments.goal_metrics"]) == {
+        "goal_distance_m": "least distance from the place"
+    }
+
+
 def test_the_arms_of_tracks_without_truth_are_told(launch: Command) -> None:
     csv_tracks.write("tracks.csv", protocol(0).data)
     words = ["engine.num_steps=200", "engine.warmup=100", "engine.thin=1", "engine.polish=false"]
@@ -134,6 +143,14 @@ def test_bad_input_is_one_sentence_and_leaves_nothing(launch: Command) -> None:
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "num is 0" in done.stderr
     assert not list(Path("runs").iterdir())
+
+
+def test_a_config_that_is_no_yaml_is_one_sentence(launch: Command) -> None:
+    Path("conf/experiment").mkdir()
+    Path("conf/experiment/broken.yaml").write_text("a: [1,\n")
+    done = launch("--config-dir", "conf", "experiment=broken")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert "a config file cannot be read" in done.stderr and "broken.yaml" in done.stderr and "line 2" in done.stderr
 
 
 def test_a_failed_job_does_not_stop_the_sweep(launch: Command) -> None:
@@ -231,6 +248,14 @@ def test_a_folder_that_hides_our_packages_is_named(launch: Command) -> None:
     done = launch(*FAKE)
     assert done.returncode == 2
     assert "the package 'configs'" in done.stderr and "hides it" in done.stderr
+
+
+def test_a_folder_that_hides_the_planner_is_named(launch: Command) -> None:
+    Path("planning").mkdir()
+    Path("planning/__init__.py").touch()
+    done = launch(module="experiments.drive")
+    assert done.returncode == 2
+    assert "the package 'planning'" in done.stderr and "hides it" in done.stderr
 
 
 def test_a_scenario_that_does_not_fit_the_model_is_refused() -> None:

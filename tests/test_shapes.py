@@ -14,7 +14,18 @@ from shapely import affinity
 from models.program import InputError
 from planning.boundary_kernel import first_line
 from planning.check_kernel import first_rectangle
-from planning.shapes import CLEARANCE, OUTLINE, ROUND, Boundary, Obstacles, Vehicle, boundary, outlines
+from planning.shapes import (
+    CLEARANCE,
+    OUTLINE,
+    ROUND,
+    Boundary,
+    Obstacles,
+    Vehicle,
+    boundary,
+    check_obstacles,
+    no_obstacles,
+    outlines,
+)  # fmt: skip
 
 VEHICLE = Vehicle()
 CERTAIN = (1e-3, np.ones(1), np.full(1, 3.0902), np.zeros(1))  # one rectangle that must not be touched
@@ -180,6 +191,22 @@ def test_long_segments_are_kept_where_they_pass_and_the_grid_ends_with_what_is_k
 def test_lines_that_are_none_are_refused(line: np.ndarray) -> None:
     with pytest.raises(InputError, match="boundary line 0"):
         boundary([line], 1.0)
+
+
+@pytest.mark.parametrize("far", [math.nan, math.inf, -1.0])
+def test_reaches_that_are_none_are_refused(far: float) -> None:
+    line = np.array([(0.0, 0.0), (1.0, 1.0)])
+    with pytest.raises(InputError, match="boundary lines: reach is"):
+        boundary([line], far)
+    if not math.isfinite(far):
+        with pytest.raises(InputError, match="boundary lines: within is"):
+            boundary([line], 1.0, within=(0.0, 0.0, far))
+
+
+def test_obstacles_of_words_are_refused() -> None:
+    wrong = no_obstacles(3)._replace(probability=np.zeros(0, np.str_))
+    with pytest.raises(InputError, match=r"probability is an array of .*, but must be one of numbers"):
+        check_obstacles(wrong, 3)
 
 
 @settings(max_examples=200)

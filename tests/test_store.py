@@ -25,6 +25,9 @@ def test_a_run_with_failures_is_not_done(tmp_path: Path) -> None:
     assert store.is_done(tmp_path)
     store.write_json(tmp_path / "manifest.json", {"failures": {"figure fit": "no ink"}})
     assert not store.is_done(tmp_path)
+    for damaged in ("", "{", "[1]"):
+        (tmp_path / "manifest.json").write_text(damaged)
+        assert not store.is_done(tmp_path)
 
 
 def test_a_failure_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> None:

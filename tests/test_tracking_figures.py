@@ -67,6 +67,16 @@ def test_the_moving_picture_is_small_and_shows_its_frames(tmp_path: Path) -> Non
     assert (tmp_path / "a.gif").stat().st_size < 3_000_000 * 40 / 100
 
 
+def test_a_flat_scene_is_drawn_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    truth = traffic(num=8, num_scans=3)
+    drawn = figures(believed(truth), Scene(None, truth, "drawn", {}), frames=2)["animation"]
+    flat = replace(drawn, limits=(np.array([-100.0, -10.0]), np.array([100.0, 10.0])))
+    flat.savefig(tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as film:
+        assert film.height == pytest.approx(0.4 * film.width, abs=2)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("what", ["no truth", "no tracks", "neither", "points", "velocity", "unsure"])
 def test_pictures_do_without_what_is_missing(what: str, tmp_path: Path) -> None:
     truth = traffic()

@@ -234,6 +234,7 @@ def test_poses_are_as_wrong_as_they_say() -> None:
         (crossing_targets, {"noise": 0.0}, "noise 0.0"),
         (crossing_targets, {"detection": 1.5}, "detection is 1.5"),
         (crossing_targets, {"clutter": math.nan}, "clutter nan"),
+        (crossing_targets, {"clutter": 1e9}, "0 to 100000 false alarms a scan"),
         (close_targets, {"number": 1}, "two vehicles or more"),
         (close_targets, {"spacing": math.nan}, "spacing is nan"),
         (close_targets, {"duration": 100.0}, "duration 100.0"),

@@ -32,6 +32,7 @@ FEWEST = 3  # states that tell an acceleration
 SLOWEST = 1.0  # speed wanted of who starts at rest and has nothing else to go by [m/s]
 NAMED = 8  # lanes in a sentence about lanes, at most
 BEHIND = 30.0  # of the route, behind where it begins [m]
+LONGEST = 1e5  # that a way goes on behind the map [m]
 
 
 def commonroad(
@@ -67,6 +68,8 @@ def commonroad(
     for name, value in {"speed": speed, "duration": duration, "beyond": beyond, "window": window}.items():
         if value is not None and not 0 < value < math.inf:
             raise InputError(f"scenario.{name} is {value}, but must be positive and finite")
+    if beyond > LONGEST:
+        raise InputError(f"scenario.beyond is {beyond:g} m, but a way goes on by {LONGEST:g} m at most; choose less")
     if not 0 <= noise < math.inf:
         raise InputError(f"scenario.noise is {noise}, but must be 0 or more [m, m/s]")
     told = read(file)

@@ -19,6 +19,7 @@ from models.objects.sensors import Position
 from models.objects.traffic import Kind, Traffic
 from models.program import InputError
 
+MOST_CLUTTER = 1e5  # of a scan
 SCANS, EXTENT = 100, 1000.0  # number; half width of the square [m]
 # x, vx, y, vy at birth [m], [m/s]; the scan of birth, and the first without the target
 TARGETS = (
@@ -45,10 +46,10 @@ def crossing_targets(seed: int = 0, clutter: float = 30.0, detection: float = 0.
     noise      standard deviation of x and y [m]
 
     Raises InputError for a negative seed or clutter, a noise that is not positive, and what is no probability."""
-    if seed < 0 or not 0.0 <= clutter < math.inf or not 0.0 < noise < math.inf:
+    if seed < 0 or not 0.0 <= clutter <= MOST_CLUTTER or not 0.0 < noise < math.inf:
         raise InputError(
             f"scenario crossing_targets: seed is {seed}, clutter {clutter} and noise {noise}; "
-            "give seed and clutter >= 0 and noise > 0"
+            f"give seed >= 0, 0 to {MOST_CLUTTER:g} false alarms a scan and noise > 0"
         )
     sensor = Position(name="plots", noise_std=(noise, noise), detection=detection, clutter=clutter, extent=EXTENT)
     model = Traffic((sensor,), ConstantVelocity(), (Kind(noise=(1.0, 1.0)),))

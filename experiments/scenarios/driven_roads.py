@@ -118,6 +118,8 @@ def roundabout(*, duration: float = 40.0) -> DriveScene:
 
 def box(*, distance: float = 10.05, duration: float = 8.0) -> DriveScene:
     """Walls to both sides, and one ahead, `distance` metres before the front."""
+    if not 0 < distance < math.inf:
+        raise InputError(f"box: distance is {distance} m, but must be positive and finite")
     road = _road(200.0, bend=0.0)
     front = 20.0 + 3.85 + distance
     walls = (

@@ -30,6 +30,17 @@ class Body(NamedTuple):
     size: tuple[float, float]
 
 
+def _check_finite(who: str, **values: float) -> None:
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise InputError(f"{who}: {name} is {value}, but must be finite")
+
+
+def _check_size(who: str, size: tuple[float, float]) -> None:
+    if len(size) != 2 or not all(0 < side < math.inf for side in size):
+        raise InputError(f"{who}: its size is {size}, but must be length and width, positive and finite [m]")
+
+
 class Actor(Protocol):
     """A road user of a scene.
 
@@ -52,6 +63,8 @@ class Scripted:
     speed   ((t, v), ...) [s, m/s], linear in between and constant beyond
     offset  ((t, d), ...) [s, m] to the left of the line, smooth in between (d' = d'' = 0 at each)
     there   (from, until) [s]
+
+    Raises InputError for numbers that are not finite, times that do not rise, speeds below 0 and sizes that are none.
     """
 
     line: ReferenceLine
@@ -61,6 +74,19 @@ class Scripted:
     kind: str = "car"
     size: tuple[float, float] = CAR
     there: tuple[float, float] = (0.0, math.inf)
+
+    def __post_init__(self) -> None:
+        _check_finite("a scripted road user", start=self.start)
+        for name, told in (("speed", self.speed), ("offset", self.offset)):
+            table = np.asarray(told, float)
+            if table.ndim != 2 or table.shape[1] != 2 or not np.isfinite(table).all():
+                raise InputError(f"a scripted road user: {name} is {told}, but must be ((time, value), ...), finite")
+            if not (np.diff(table[:, 0]) > 0).all():
+                raise InputError(f"a scripted road user: the times of its {name} must rise, but are {table[:, 0]}")
+        for _, v in self.speed:
+            if v < 0:
+                raise InputError(f"a scripted road user: its speed is {v} m/s; give it a line that runs the other way")
+        _check_size("a scripted road user", self.size)
 
     def moved(self, time: float, step: float, before: Pose | None, others: Sequence[Body]) -> Pose | None:
         """At a time, whatever others do."""
@@ -115,6 +141,7 @@ class Recorded:
             raise InputError(f"a record of {len(self.time)} times needs ({len(self.time)}, 5) finite poses")
         if not len(self.time) or not (np.diff(self.time) > 0).all():
             raise InputError("the times of a record must rise")
+        _check_size("a recorded road user", self.size)
 
     def moved(self, time: float, step: float, before: Pose | None, others: Sequence[Body]) -> Pose | None:
         """At a time, whatever others do."""
@@ -133,6 +160,8 @@ class Reacting:
 
     start, speed   arc length [m] and speed [m/s] at time 0
     wanted         [m/s]; headway T [s], gap g_0 [m], acceleration a_max and braking b [m/s^2]
+
+    Raises InputError for numbers that are not finite, or not positive where they must be.
     """
 
     line: ReferenceLine
@@ -145,6 +174,17 @@ class Reacting:
     braking: float = 2.0
     kind: str = "car"
     size: tuple[float, float] = CAR
+
+    def __post_init__(self) -> None:
+        who = "a reacting road user"
+        _check_finite(who, start=self.start)
+        for name in ("wanted", "acceleration", "braking"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"{who}: {name} is {getattr(self, name)}, but must be positive and finite")
+        for name in ("speed", "headway", "gap"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{who}: {name} is {getattr(self, name)}, but must be 0 or more and finite")
+        _check_size(who, self.size)
 
     def moved(self, time: float, step: float, before: Pose | None, others: Sequence[Body]) -> Pose | None:
         """A step after `before`."""
@@ -217,6 +257,44 @@ class DriveScene(NamedTuple):
     def lights_at(self, time: float) -> dict[str, str]:
         """{name of a stop point: state of its light}"""
         return {name: [state for since, state in told if since <= time][-1] for name, told in self.lights.items()}
+
+
+LIGHTS = ("green", "yellow", "red")
+
+
+def check(scene: DriveScene) -> None:
+    """Raises InputError for a scene that is none to drive in, with the part, its value and what it must be: how the
+    vehicle stands on the map, the route and road users are judged where they are used."""
+    where = f"scene {scene.name}"
+    if not scene.ego.speed >= 0.0:
+        raise InputError(f"{where}: the vehicle's speed is {scene.ego.speed} m/s, but must be 0 or more")
+    if not scene.wanted > 0.0:
+        raise InputError(f"{where}: the speed wanted is {scene.wanted} m/s, but must be positive; infinity means any")
+    for number, actor in enumerate(scene.actors):
+        if not hasattr(actor, "moved"):
+            raise InputError(f"{where}: road user {number} is a {type(actor).__name__}, which does not move; see Actor")
+    for point in scene.stops:
+        zone = np.asarray(point.zone)
+        if not -math.inf < point.s <= point.end < math.inf:
+            raise InputError(
+                f"{where}: stop point {point.name} is from {point.s} to {point.end} m; end no sooner than s"
+            )
+        if zone.ndim != 2 or zone.shape[1] != 2 or len(zone) < 3 or not np.isfinite(zone).all():
+            raise InputError(
+                f"{where}: the zone of stop point {point.name} has shape {zone.shape}; give (N, 2) corners"
+            )
+    names = [point.name for point in scene.stops]
+    for name, told in scene.lights.items():
+        if name not in names:
+            raise InputError(f"{where}: the light {name!r} is of no stop point; there are {names}")
+        times = [since for since, _ in told]
+        if not times or times[0] > 0 or not (np.diff(times) > 0).all():
+            raise InputError(f"{where}: the light {name!r} changes at {times} s; give rising times from 0 on")
+        for _, state in told:
+            if state not in LIGHTS:
+                raise InputError(
+                    f"{where}: the light {name!r} is {state!r} once, but must be one of {', '.join(LIGHTS)}"
+                )
 
 
 def observe(scene: DriveScene, poses: Sequence[Pose | None], rng: np.random.Generator) -> Tracks:

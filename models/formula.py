@@ -148,7 +148,11 @@ def _traced(formula: Formula) -> Any:
     import casadi
 
     x, p = casadi.SX.sym("x", formula.num_x), casadi.SX.sym("p", formula.num_p)
-    y = formula.function(tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(p)), _casadi_ops())
+    try:
+        y = formula.function(tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(p)), _casadi_ops())
+    except Exception as error:
+        error.add_note(f"formula '{formula.name}' is told to CasADi by symbols: use ops, not math; ops.where, not if")
+        raise
     return casadi.Function(formula.name, [x, p], [casadi.densify(casadi.vertcat(*y))])
 
 

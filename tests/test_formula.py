@@ -145,3 +145,9 @@ def test_one_point_inside_other_machine_code_is_the_same(name: str) -> None:
     for x in POINTS:
         expected = 2 * formula(x[None], np.array([[0.7]]))[0]
         np.testing.assert_allclose(doubled(x[0], x[1], 0.7), expected, rtol=1e-14)
+
+
+def test_a_branch_on_a_symbol_is_told_what_to_do() -> None:
+    with pytest.raises(RuntimeError) as caught:
+        Formula("step", lambda x, p, ops: (1.0 if x[0] > 0.0 else 0.0,), 1).casadi()
+    assert "formula 'step' is told to CasADi by symbols" in caught.value.__notes__[0]

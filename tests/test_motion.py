@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 from models.objects.motion import ConstantTurn, ConstantVelocity, Motion, move_formula, noise_formula
+from models.program import InputError
 
 Floats = NDArray[np.float64]
 BOX = ("length", "width")
@@ -142,3 +146,21 @@ def test_extras_are_random_walks() -> None:
     found = move_formula(motion)(x[None], settings(motion, 0.7, std))[0]
     np.testing.assert_array_equal(found[-2:], x[-2:])
     np.testing.assert_allclose(covariance(motion, x, 0.7, std)[-2:, -2:], 0.7 * np.diag(std[-2:] ** 2), rtol=1e-14)
+
+
+def test_a_motion_that_forgets_an_entry_is_told() -> None:
+    @dataclass(frozen=True)
+    class Short(ConstantVelocity):
+        def move(self, x: Any, dt: Any, ops: Any) -> Any:
+            return super().move(x, dt, ops)[:3]
+
+    @dataclass(frozen=True)
+    class Long(ConstantVelocity):
+        def noise(self, x: Any, dt: Any, std: Any, ops: Any) -> Any:
+            return [(*column, 0.0) for column in super().noise(x, dt, std, ops)]
+
+    x, step = np.zeros((1, 4)), np.full((1, 3), 0.1)
+    with pytest.raises(InputError, match=re.escape("Short.move gives 3 values, but must give 4, a tuple of (x, y, vx")):
+        move_formula(Short())(x, step)
+    with pytest.raises(InputError, match=r"a column of Long.noise gives 5 values, but must give 4"):
+        noise_formula(Long())(x, step)

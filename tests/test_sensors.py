@@ -232,6 +232,17 @@ def test_a_new_sensor_is_one_class() -> None:
     np.testing.assert_allclose(found[found[:, 1].argsort()[::-1], :2], way[-1][:, :2], atol=1.0)
 
 
+def test_a_sensor_that_forgets_a_value_is_told() -> None:
+    class Deaf(Sonar):
+        @staticmethod
+        def measure(body: Body, at: Any, ops: Any) -> Any:
+            return ops.log(body.x)
+
+    formula, _ = sensor_formulas(ConstantVelocity(), Deaf, 4)
+    with pytest.raises(InputError, match=r"Deaf.measure gives a SX, but must give 2, a tuple of \(log_range"):
+        formula.casadi()
+
+
 def test_an_object_outside_every_view_keeps_its_existence() -> None:
     sensors = (
         RangeBearing(name="front", noise_std=(0.1, 0.01), angle=1.0, reach=(0.0, 60.0), detection=0.99),

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.formula import Formula
+from models.program import InputError
 
 Floats = NDArray[np.float64]
 Scalars = Sequence[Any]
@@ -177,13 +178,22 @@ def _twice_integrated_white(dt: Any, q: Any, ops: Any) -> tuple[Scalars, ...]:
     return first, (0.0, root * dt / math.sqrt(48.0), root / math.sqrt(3.0)), (0.0, 0.0, root / 3)
 
 
+def check_length(what: str, values: Any, names: Sequence[str]) -> None:
+    """Raises InputError where what a motion or a sensor gives is not one value for each name."""
+    if not isinstance(values, (tuple, list)) or len(values) != len(names):
+        given = f"{len(values)} values" if isinstance(values, (tuple, list)) else f"a {type(values).__name__}"
+        raise InputError(f"{what} gives {given}, but must give {len(names)}, a tuple of ({', '.join(names)})")
+
+
 @lru_cache
 def move_formula(motion: Motion) -> Formula:
     """(x; step) -> f(x). A step is dt and standard deviations by `noises`, which f does not read."""
     own = len(motion.names) - len(motion.extras)
 
     def move(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        return (*motion.move(x, p[0], ops), *x[own:])
+        moved = motion.move(x, p[0], ops)
+        check_length(f"{type(motion).__name__}.move", moved, motion.names[:own])
+        return (*moved, *x[own:])
 
     return Formula("move", move, len(motion.names), 1 + len(motion.noises))
 
@@ -195,7 +205,10 @@ def noise_formula(motion: Motion) -> Formula:
     own, first = size - len(motion.extras), num - len(motion.extras)
 
     def noise(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        columns = [(*column, *(0.0,) * (size - own)) for column in motion.noise(x, p[0], p[1:first], ops)]
+        columns = [*motion.noise(x, p[0], p[1:first], ops)]
+        for column in columns:
+            check_length(f"a column of {type(motion).__name__}.noise", column, motion.names[:own])
+        columns = [(*column, *(0.0,) * (size - own)) for column in columns]
         for entry, q in zip(range(own, size), p[first:num], strict=True):
             step = q * ops.sqrt(p[0])
             columns.append(tuple(step if i == entry else 0.0 for i in range(size)))

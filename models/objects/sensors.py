@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.formula import Formula
-from models.objects.motion import ANGLES, Body, Motion
+from models.objects.motion import ANGLES, Body, Motion, check_length
 from models.objects.newcomers import from_polar
 from models.objects.perception import capability, combined, hidden_share, hindrance, logistic, probability
 from models.objects.scans import Scan
@@ -215,7 +215,9 @@ def sensor_formulas(motion: Motion, sensor: type[Sensor], num_settings: int) -> 
     label, size = sensor.__name__.lower(), len(motion.names)
 
     def measure(x: Scalars, p: Scalars, ops: Any) -> Scalars:
-        return sensor.measure(motion.body(x, ops), p, ops)
+        seen = sensor.measure(motion.body(x, ops), p, ops)
+        check_length(f"{sensor.__name__}.measure", seen, sensor.names)
+        return seen
 
     def detect(x: Scalars, p: Scalars, ops: Any) -> Scalars:
         return (sensor.detect(motion.body(x, ops), p[:3], p[3:-1], p[-1], ops),)

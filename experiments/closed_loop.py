@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.scenarios.driving import Body, DriveScene, check, observe
+from inference.progress import Progress
 from models.program import InputError
 from planning.control import Command, Control, Lags, command, moved
 from planning.frenet import FrenetState, Pose, to_frenet, to_pose
@@ -137,8 +138,9 @@ def drive(
     loop: Loop = Loop(),
     *,
     seed: int = 0,
+    progress: bool = False,
 ) -> Drive:
-    """Drive through a scene.
+    """Drive through a scene, with a bar where that takes long and `progress` is asked for. Candidates are let go.
 
     Raises InputError for a scene that cannot be begun (a route that is none, a vehicle off it, no time to drive), for
     a driver that is none, and for time steps that do not fit into one another."""
@@ -168,36 +170,39 @@ def drive(
     per_look = round(loop.world / loop.control.step)
     horizon, gone = planner.step * np.arange(planner.num_steps + 1, dtype=np.float64), round(cycle / planner.step)
     planned: list[Floats] = []
-    for number in range(round(scene.duration / cycle)):
-        now, began, stated, words = number * cycle, time.perf_counter(), "", ""
-        tracks = observe(scene, others, rng)
-        try:
-            state = _start(way, ego, followed, cycle, loop.tolerance)
-            given, words = _thought(think(now, state, tracks))
-            found = plan(planner, given, made, cycle)
-            if loop.refine:
-                better = refine(planner, given, found, better, cycle, solve=found.tier != EMERGENCY)
-        except InputError as error:
-            if followed is None or given is None:
-                raise
-            stated = str(error)
-            found, better = stop_along(planner, followed, cycle), None
-        made, followed = found, found if better is None or not better.accepted else better
-        building, why = (0.0, "") if better is None else (better.building, "" if better.accepted else better.why)
-        ms = 1e3 * (time.perf_counter() - began - building)
-        planned.append(followed.trajectory(horizon))
-        apart = math.nan if number == 0 else _apart(planned[-1][:-gone], planned[-2][gone:])
-        cycles.append((now, ms, building, found, followed, why, apart, given.stop, _aim(given), words, stated))
-        givens.append(given)
-        plans.append(found)
-        poses = [Pose(*row) for row in followed.trajectory(np.arange(0.0, cycle + 1e-9, loop.control.step))]
-        for k, (wanted, after) in enumerate(pairwise(poses), start=1):
-            told = command(loop.control, planner.able, ego, wanted, after)
-            driven.append((ego, wanted, told))
-            ego = moved(loop.lags, ego, told, loop.control.step)
-            if k % per_look == 0:
-                others = _others(scene, planner.vehicle, now + k * loop.control.step, loop.world, others, ego)
-                looks.append(others)
+    num_cycles = round(scene.duration / cycle)
+    with Progress("driving", num_cycles, progress) as bar:
+        for number in range(num_cycles):
+            now, began, stated, words = number * cycle, time.perf_counter(), "", ""
+            tracks = observe(scene, others, rng)
+            try:
+                state = _start(way, ego, followed, cycle, loop.tolerance)
+                given, words = _thought(think(now, state, tracks))
+                found = plan(planner, given, made, cycle)._replace(candidates=None)
+                if loop.refine:
+                    better = refine(planner, given, found, better, cycle, solve=found.tier != EMERGENCY)
+            except InputError as error:
+                if followed is None or given is None:
+                    raise
+                stated = str(error)
+                found, better = stop_along(planner, followed, cycle), None
+            made, followed = found, found if better is None or not better.accepted else better
+            building, why = (0.0, "") if better is None else (better.building, "" if better.accepted else better.why)
+            ms = 1e3 * (time.perf_counter() - began - building)
+            planned.append(followed.trajectory(horizon))
+            apart = math.nan if number == 0 else _apart(planned[-1][:-gone], planned[-2][gone:])
+            cycles.append((now, ms, building, found, followed, why, apart, given.stop, _aim(given), words, stated))
+            givens.append(given)
+            plans.append(found)
+            poses = [Pose(*row) for row in followed.trajectory(np.arange(0.0, cycle + 1e-9, loop.control.step))]
+            for k, (wanted, after) in enumerate(pairwise(poses), start=1):
+                told = command(loop.control, planner.able, ego, wanted, after)
+                driven.append((ego, wanted, told))
+                ego = moved(loop.lags, ego, told, loop.control.step)
+                if k % per_look == 0:
+                    others = _others(scene, planner.vehicle, now + k * loop.control.step, loop.world, others, ego)
+                    looks.append(others)
+            bar.advance(1)
     driven.append((ego, poses[-1], told))
     return Drive(scene, way, planner, _log(scene, loop, driven, looks, cycles, planned), givens, plans)
 

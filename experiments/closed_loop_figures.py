@@ -88,7 +88,7 @@ def fan_of(drive: Drive, number: int, most: int) -> Fan:
     previous, cycle = drive.plans[number - 1] if number else None, drive.planner.fans.cycle
     found = plan(drive.planner, drive.given[number], previous, cycle, all_reasons=True)
     made = found.candidates
-    if found.tier == EMERGENCY:  # then these are stops: show what was wanted before them
+    if made is None or found.tier == EMERGENCY:  # then these are stops: show what was wanted before them
         made = candidates_of(drive.planner, drive.given[number], previous, cycle)
         made = judge(drive.planner, drive.given[number], made, drive.planner.comfort, first_good=False)
     shown = made.order[np.unique(np.linspace(0, len(made.order) - 1, most).astype(int))]

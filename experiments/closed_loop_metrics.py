@@ -35,7 +35,7 @@ what is followed, and the lane's speed limit; 2 % more is no violation.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ def metrics(drive: Drive, *, gap: float = 4.0, headway: float = 1.2) -> dict[str
     apart = np.hypot(*(log.ego - log.wanted)[:, :2].T)
     out = {
         "collisions": float(len(touched)),
-        "collisions_at_fault": float(sum(touched.values())),
+        "collisions_at_fault": float(sum(not one.excuse for one in touched)),
         **clearances(drive),
         "limit_violations": float(violations(drive).sum()),
         "stops_passed": float(stops_passed(drive)),
@@ -109,13 +109,22 @@ def ego_middles(drive: Drive) -> Floats:
     return ego
 
 
-def contacts(drive: Drive) -> dict[int, bool]:
-    """{actor, or -1 for boundary lines: whether the vehicle is at fault} of each touched, at its first touch."""
+class Contact(NamedTuple):
+    """The first touch of an actor, -1 for boundary lines, at a time [s]; `excuse`: why the vehicle is not at fault,
+    nothing where it is."""
+
+    actor: int
+    time: float
+    excuse: str
+
+
+def contacts(drive: Drive) -> list[Contact]:
+    """Of each road user touched, and of boundary lines."""
     import shapely
 
     ego, vehicle = ego_middles(drive), drive.planner.vehicle
     own = shapely.polygons(outlines(ego, (vehicle.length, vehicle.width)))
-    found = {}
+    found = []
     for n, actor in enumerate(drive.scene.actors):
         pose = drive.log.others[:, n]
         there = np.flatnonzero(np.isfinite(pose[:, 0]))
@@ -123,11 +132,12 @@ def contacts(drive: Drive) -> dict[int, bool]:
         if len(hit):
             stood = drive.log.looked >= drive.log.looked[hit[0]] - STOOD
             stands = bool((ego[: hit[0] + 1][stood[: hit[0] + 1], 3] < STANDING).all()) and hit[0] > 0
-            found[n] = not (stands or _from_behind(ego[hit[0]], pose[hit[0]]))
+            behind = _from_behind(ego[hit[0]], pose[hit[0]])
+            excuse = "from behind" if behind else f"the vehicle had stood for {STOOD:g} s" if stands else ""
+            found.append(Contact(n, float(drive.log.looked[hit[0]]), excuse))
     lines = [shapely.linestrings(line) for line in drive.scene.boundary]
-    if lines and shapely.intersects(own, shapely.multilinestrings(lines)).any():
-        found[-1] = True
-    return found
+    over = np.flatnonzero(shapely.intersects(own, shapely.multilinestrings(lines))) if lines else ()
+    return found + [Contact(-1, float(drive.log.looked[k]), "") for k in over[:1]]
 
 
 def _from_behind(ego: Floats, other: Floats) -> bool:

@@ -65,7 +65,7 @@ def execute(job: Job, say: Callable[[str], None] = print) -> dict[str, float]:
     say(f"scenario   {scene.name}, {scene.duration:g} s")
     seconds: dict[str, float] = {}
     began = time.perf_counter()
-    found = drive(scene, parts["driver"], parts["planner"], parts["loop"], seed=job.config["seed"])
+    found = drive(scene, parts["driver"], parts["planner"], parts["loop"], seed=job.config["seed"], progress=True)
     seconds["drive"] = time.perf_counter() - began
     seconds["building"] = float(found.log.building.sum())
     of_it = f", of it {seconds['building']:.1f} s to build problems of optimal control" if seconds["building"] else ""
@@ -152,8 +152,13 @@ def report(
     manifest: dict[str, Any],
 ) -> str:
     """The drive as one page that needs nothing else."""
+    from experiments.closed_loop_metrics import contacts
     from experiments.report import details, failure_boxes, page, scores_table, table
 
+    touched = [
+        (f"{one.time:.2f}", f"road user {one.actor}" if one.actor >= 0 else "boundary line", one.excuse or "at fault")
+        for one in contacts(found)
+    ]
     stated = [(f"{at:.2f}", why) for at, why in zip(found.log.cycle, found.log.stated, strict=True) if why]
     thought = [("0.00", found.log.words[0])]
     for at, words in zip(found.log.cycle[1:], found.log.words[1:], strict=True):
@@ -171,6 +176,7 @@ def report(
         "<h2>Scores</h2>",
         scores_table(scores, manifest["config"]["metrics"]),
         "".join(f"<h2>{escape(name.replace('_', ' ').capitalize())}</h2>{image}" for name, image in images.items()),
+        *(["<h2>Touched</h2>", table(("first at [s]", "what", "fault"), touched)] if touched else []),
         "<h2>Cycles that could not be planned</h2>",
         table(("time [s]", "why"), stated),
         "<h2>Candidates turned down</h2>",

@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 COMFORT, RELAXED, EMERGENCY = "comfort", "relaxed", "emergency"
 ON_PLAN = 1e-9  # [m, s] between the vehicle and its last plan, for the rest of that plan to be a candidate
 ANY = Limits(*(1e9,) * 7)  # no limits but those of geometry
+MOST_STEPS = 10_000
 AT_REST = 1e-3  # [m/s] below which a vehicle stands
 FAR = 0.05  # of an equal share of the risk, for road users that a candidate does not come near to
 
@@ -65,8 +66,10 @@ class Planner:
         for name in ("horizon", "step", "risk"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"planner: {name} is {getattr(self, name)}, but must be positive and finite")
-        if self.num_steps < 1:
-            raise InputError(f"planner: a horizon of {self.horizon} s has no step of {self.step} s")
+        if not 1 <= self.horizon / self.step + 0.5 < MOST_STEPS:
+            raise InputError(
+                f"planner: a horizon of {self.horizon} s has no step of {self.step} s, or more than {MOST_STEPS}"
+            )
         if self.risk >= 1.0:
             raise InputError(f"planner: risk is {self.risk}, but is a probability below 1")
         for name in (*LIMITS, "curvature_rate"):
@@ -100,6 +103,10 @@ def plan(
     from planning.check_kernel import GOOD, OBSTACLE, ON_LIMITS
 
     check(scene, planner.radius, planner.num_steps)
+    if not (previous is None or isinstance(previous, Plan)) or not 0.0 <= elapsed < math.inf:
+        raise InputError(
+            f"the previous plan is a {type(previous).__name__}, {elapsed} s ago; give a Plan and 0 s or more"
+        )
     made = candidates_of(planner, scene, previous, elapsed)
     judged = judge(planner, scene, made, planner.comfort, first_good=not all_reasons)
     if judged.best < 0 and scene.state.ds >= planner.fans.slow:

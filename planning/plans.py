@@ -41,6 +41,7 @@ class Plan(NamedTuple):
     clear      whether it breaks nothing within the horizon (an emergency stop may, and others who stands)
     cost       of its candidate
     rejected   {reason: how many cheaper candidates were turned down for it} (planning.check_kernel.REASONS)
+    candidates that it was chosen from; None where they were let go (a megabyte)
     """
 
     line: ReferenceLine
@@ -51,7 +52,7 @@ class Plan(NamedTuple):
     clear: bool
     cost: float
     rejected: dict[str, int]
-    candidates: Candidates
+    candidates: Candidates | None
 
     def along(self, t: Floats) -> Floats:
         """s, s', s'' (K, 3), never backwards: it stands where the motion turns, until that is back."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from planning.shapes import Boundary, Obstacles, check_obstacles
 
 Floats = NDArray[np.float64]
 LARGEST = 1e6  # of what a state or a goal tells: powers of more overflow
+BACKWARDS = 0.05  # a speed back that noise may tell of who stands [m/s]
 
 
 class Scene(NamedTuple):
@@ -59,9 +61,14 @@ def check(scene: Scene, radius: float, num_steps: int) -> None:
         if not isinstance(part := getattr(scene, name), kinds):
             words = " or ".join(kind.__name__ for kind in kinds)
             raise InputError(f"scene: {name} is of type {type(part).__name__}, but must be {words}")
+    table = scene.line.table
+    if np.ndim(table) != 2 or table.shape[1] != 5 or len(table) < 2 or not np.isfinite(table).all():
+        raise InputError(f"the line's table has shape {np.shape(table)}, but must be finite and (2 or more, 5)")
     for name, value in zip(scene.state._fields, scene.state, strict=True):
-        if not abs(value) < LARGEST:
-            raise InputError(f"the vehicle's state has {name} = {value}")
+        if not (isinstance(value, Real) and abs(value) < LARGEST):
+            raise InputError(f"the vehicle's state has {name} = {value!r}, but must have a number")
+    if scene.state.ds < -BACKWARDS:
+        raise InputError(f"the vehicle drives backwards, at {scene.state.ds} m/s; plans only go forwards")
     if not 0.0 <= scene.state.s <= scene.line.length:
         raise InputError(
             f"the vehicle is at s {scene.state.s:.1f} m of a line from 0 to {scene.line.length:.1f} m; "
@@ -76,10 +83,11 @@ def check(scene: Scene, radius: float, num_steps: int) -> None:
         np.ndim(scene.offsets) != 1
         or not len(scene.offsets)
         or not np.isfinite(scene.offsets).all()
-        or not math.isfinite(scene.wanted)
+        or not (isinstance(scene.wanted, Real) and math.isfinite(scene.wanted))
     ):
         raise InputError(
-            f"offsets to drive to are {np.asarray(scene.offsets).tolist()}, but must be one or more numbers"
+            f"offsets to drive to are {np.asarray(scene.offsets).tolist()} and {scene.wanted!r} is wanted, "
+            "but they must be one or more numbers, and a number"
         )
     if scene.boundary.reach < radius:
         raise InputError(
@@ -88,6 +96,6 @@ def check(scene: Scene, radius: float, num_steps: int) -> None:
         )
     for name in ("stop", "stand"):
         value = getattr(scene, name)
-        if value is None or math.isnan(value):
+        if not isinstance(value, Real) or math.isnan(value):
             raise InputError(f"scene: {name} is {value}; infinity means none")
     check_obstacles(scene.obstacles, num_steps)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.closed_loop import Drive, drive
-from experiments.closed_loop_metrics import contacts, metrics
+from experiments.closed_loop_metrics import Contact, contacts, metrics
 from experiments.driver import by_the_rules
 from experiments.goal_metrics import goals, within_turn
 from experiments.scenarios.commonroad import Light, read
@@ -340,10 +340,10 @@ def test_who_has_stood_for_a_second_is_not_at_fault(write: Any) -> None:
     others[:, 1] = [0.0, 0.0, math.pi, 10.0, 0.0]
     others[:, 1, 0] = 45.0 - 10.0 * looked  # its front meets ours after (45 - 2 - 20 - 2.45) / 10 = 2.055 s
     stands = found._replace(log=log._replace(ego=ego, others=others))
-    assert contacts(stands) == {1: False}
+    assert contacts(stands) == [Contact(1, pytest.approx(2.1), "the vehicle had stood for 1 s")]
     ego = ego.copy()
     ego[log.time < 1.5, 3] = 1.0
-    assert contacts(found._replace(log=log._replace(ego=ego, others=others))) == {1: True}
+    assert [one.excuse for one in contacts(found._replace(log=log._replace(ego=ego, others=others)))] == [""]
 
 
 @recorded

@@ -332,6 +332,12 @@ def test_unlikely_and_uncertain_road_users() -> None:
         ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), [[1, 0.5], [0, 1]]))}, "symmetric"),
         ({"obstacles": rectangle(40, 0)._replace(covariance=np.full((1, 60, 2, 2), -np.eye(2)))}, "negative eigen"),
         ({"stop": None}, "stop is None; infinity means none"),
+        ({"stand": "far"}, "stand is far; infinity means none"),
+        ({"wanted": None}, "None is wanted, but they must be one or more numbers"),
+        ({"state": START._replace(d="0")}, "state has d = '0', but must have a number"),
+        ({"state": START._replace(ds=-0.1)}, "drives backwards, at -0.1 m/s"),
+        ({"line": LINE._replace(table=LINE.table[:, :2])}, "table has shape \\(\\d+, 2\\)"),
+        ({"line": LINE._replace(table=LINE.table * math.nan)}, "must be finite"),
         ({"state": Pose(25.0, 0.0, 0.0, 9.0)}, "state is of type Pose, but must be FrenetState"),
         ({"goal": 9.0}, "goal is of type float, but must be Keep or Reach"),
         ({"line": np.zeros((9, 2))}, "line is of type ndarray, but must be ReferenceLine"),
@@ -343,6 +349,12 @@ def test_unlikely_and_uncertain_road_users() -> None:
 def test_scenes_that_are_none_are_refused_in_words(change: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         plan(PLANNER, scene(START, Keep(10.0))._replace(**change))
+
+
+@pytest.mark.parametrize(("previous", "elapsed"), [("last", 0.1), (None, -0.1), (None, math.nan)])
+def test_last_plans_that_are_none_are_refused(previous: Any, elapsed: float) -> None:
+    with pytest.raises(InputError, match="give a Plan and 0 s or more"):
+        plan(PLANNER, scene(START, Keep(10.0)), previous, elapsed)
 
 
 def test_limits_that_contradict_are_refused() -> None:

@@ -34,6 +34,7 @@ from planning.speeds import speed_ahead, speed_before
 
 KEEP, FOLLOW, STOP, MERGE = "keep", "follow", "stop", "merge"
 STANDS = 0.01  # ahead of the front: who stands beside a lead may stay there [m]
+MOVED, HARD = 6.0, 5.0  # [s] in which a target must come to be ahead of where one can stand by such braking [m/s^2]
 FASTER = 0.5  # a lead that is faster than this draws away: its speed is kept, no place behind it [m/s]
 
 
@@ -235,8 +236,9 @@ def braking_way(speed: float, manners: Manners) -> float:
 
 
 def _reachable(goal: Reach, state: FrenetState) -> Reach:
-    """Not behind where one can stand: no motion goes backwards."""
-    return goal._replace(place=max(goal.place, state.s + state.ds**2 / 10.0 - 6.0 * goal.speed))
+    """Not behind where one can stand, when the target has moved on for some time: no motion goes backwards."""
+    moves = float(goal.target(MOVED)[0]) - goal.place
+    return goal._replace(place=max(goal.place, state.s + state.ds**2 / (2 * HARD) - moves))
 
 
 def span(planner: Planner, route: Route, state: FrenetState, around: Passing) -> tuple[float, float]:

@@ -392,3 +392,11 @@ def test_nothing_is_hidden_the_same_cycle_is_the_same_again() -> None:
 def test_manners_that_are_none_are_refused() -> None:
     with pytest.raises(InputError, match="manners: gap is -1"):
         Manners(gap=-1.0)
+
+
+@pytest.mark.parametrize("speed", [1.2, 0.9])
+def test_a_lead_that_is_too_near_and_brakes_is_followed_comfortably(speed: float) -> None:
+    """One wants to be farther back than one is, also when it stands in the end; but there is room to stop."""
+    user = User(75.6 + VEHICLE.front + 6.0 + SIZES["car"][0] / 2, 0.0, 0.0, speed, acceleration=-1.5)
+    told = closed_loop(ROADS, WAY, FrenetState(75.6, 1.66, -0.75, 0.0), lambda t: [user], cycles=1)
+    assert told[0].memory.goal == FOLLOW and comfortable(told)

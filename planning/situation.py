@@ -8,10 +8,10 @@ and is on lane l with probability w_l / max(sum w, 1), on no lane with what is l
 its successors, it goes a way w(t) with an acceleration that fades out, and comes back to the lane's middle:
 
     w'(t) = v + a tau (1 - e^(-t / tau)) >= 0,    d(w) = (d0 + (d0' + d0 / xi) w) e^(-w / xi)
-    var w = sigma_s^2 + g (sigma_v^2 t^2 + q t^3 / 3) + (1 - g) (sigma_v tau (1 - e^(-t / tau)))^2,   g = min(v / v0, 1)
+    var w = sigma_s^2 + g (sigma_v^2 t^2 + q t^3 / 3) + (1 - g) (sigma_v tau (1 - e^(-t / tau)))^2
     var d = sigma_0^2 e^(-2 w / xi) + sigma_lane^2 (1 - e^(-2 w / xi))
 
-g: who stands is expected to stand on, so that parked cars do not grow.
+g = min(w / (v0 t), 1): who stands, or brakes to a stand, is expected to stand on, so that parked cars do not grow.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Situation:
     heading_std   [rad] of road users against their lane
     least         relations less likely than this share of the likeliest are left out
     fading        tau, in which an acceleration fades out, or what who stands seems to move [s]
-    moving        v0, from which on road users move [m/s]
+    moving        v0, the mean speed from which on road users move [m/s]
     diffusion     q, of speed [m^2/s^3]
     back          xi, way in which road users come back to the middle of their lane [m]
     lane_std      of road users about it [m]
@@ -316,7 +316,7 @@ def _variance(
     tracks: Tracks, track: Ints, along: NDArray[np.bool_], t: Floats, way: Floats, settings: Situation
 ) -> tuple[Floats, Floats]:
     """What time adds to the variances (M, T, 2) ahead and across, and what is left (M, T) of today's across."""
-    moves = np.minimum(np.abs(tracks.speed[track, None]) / settings.moving, 1.0)
+    moves = np.minimum(np.abs(way) / (settings.moving * np.maximum(t, settings.step)), 1.0)
     squared, faded = tracks.speed_std[track, None] ** 2, settings.fading * (1.0 - np.exp(-t / settings.fading))
     grown = moves * (squared * t**2 + settings.diffusion * t**3 / 3) + (1.0 - moves) * squared * faded**2
     back = np.where(along[:, None], np.exp(-2 * np.abs(way) / settings.back), 1.0)

@@ -111,6 +111,17 @@ def test_who_stands_stays_where_and_as_it_stands() -> None:
     assert grown < 1.1 * (0.2 * Situation().fading) ** 2
 
 
+def test_who_brakes_to_a_stand_grows_as_far_as_it_moves() -> None:
+    """1.2 m/s, braking by 1.5: it stands after tau ln 5 and .69 m, a mean of .23 m/s over 3 s."""
+    told, settings = tracks([User(100.0, 0.0, 0.0, 1.2, acceleration=-1.5)], speed_std=0.5), Situation()
+    found = predict(ROADS, told, TIMES)
+    way = 1.2 * math.log(5.0) - 1.5 * (math.log(5.0) - 0.8)
+    assert found.way[0, -1] == pytest.approx(way)
+    g, faded = way / 3.0, 0.5 * (1.0 - math.exp(-3.0))
+    grown = g * (0.25 * 9.0 + settings.diffusion * 27.0 / 3) + (1.0 - g) * faded**2
+    assert found.obstacles.covariance[0, -1, 0, 0] == pytest.approx(0.01 + grown)
+
+
 def test_covariances_grow_by_the_formula() -> None:
     settings = Situation()
     found = predict(ROADS, tracks([User(100.0, 0.0, 0.0, 8.0)], std=0.3, speed_std=0.5), TIMES)

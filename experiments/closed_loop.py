@@ -150,8 +150,8 @@ def drive(
         raise InputError(f"scene {scene.name}: duration is {scene.duration} s, but must be a cycle, {cycle} s, or more")
     _multiple("cycle", cycle, "world", loop.world)
     _multiple("cycle", cycle, "planner.step", planner.step)
-    if not planner.horizon > cycle:
-        raise InputError(f"planner: horizon is {planner.horizon} s, but must be longer than a cycle, {cycle} s")
+    if planner.horizon < cycle:
+        raise InputError(f"planner: horizon is {planner.horizon} s, but must be a cycle, {cycle} s, or more")
     if seed < 0:
         raise InputError(f"seed is {seed}, but must be 0 or more")
     way = route(scene.lanes, scene.route)
@@ -213,7 +213,7 @@ def _thought(found: Any) -> Thought:
         raise InputError(f"the driver answered with a {type(found).__name__}; return experiments.closed_loop.Thought")
     if not isinstance(found.given, PlanScene):
         given = type(found.given).__name__
-        raise InputError(f"the driver would have a {given} planned in; give planning.planner.Scene in its Thought")
+        raise InputError(f"the driver would have a {given} planned in; give planning.scene.Scene in its Thought")
     return found
 
 

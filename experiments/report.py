@@ -136,7 +136,7 @@ def _meaning(name: str, text: str) -> str:
     if not (found := re.search(rf"^( *{re.escape(name)}  +)(\S.*)\n", text, re.MULTILINE)):
         return ""
     more = re.match(rf"(?: {{{len(found[1])}}} *\S.*\n)*", text[found.end() :])
-    return " ".join([found[2], *(more[0] if more else "").split()])
+    return " ".join([found[2], *(more[0] if more else "").split()]).removesuffix('"""')
 
 
 def _texts(modules: Iterable[str]) -> list[str]:

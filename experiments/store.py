@@ -102,9 +102,10 @@ def is_done(folder: Path) -> bool:
     """Whether a folder holds a completed run, nothing failed in it; one whose manifest is damaged does not."""
     file = folder / "manifest.json"
     try:
-        return file.is_file() and not dict(read_json(file)).get("failures")
-    except (ValueError, TypeError):
+        told = read_json(file) if file.is_file() else None
+    except ValueError:
         return False
+    return isinstance(told, dict) and not told.get("failures")
 
 
 def manifest(

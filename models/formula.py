@@ -150,6 +150,8 @@ def _traced(formula: Formula) -> Any:
     x, p = casadi.SX.sym("x", formula.num_x), casadi.SX.sym("p", formula.num_p)
     try:
         y = formula.function(tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(p)), _casadi_ops())
+    except InputError:
+        raise
     except Exception as error:
         error.add_note(f"formula '{formula.name}' is told to CasADi by symbols: use ops, not math; ops.where, not if")
         raise

@@ -66,7 +66,7 @@ class Planner:
         for name in ("horizon", "step", "risk"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"planner: {name} is {getattr(self, name)}, but must be positive and finite")
-        if not 1 <= self.horizon / self.step + 0.5 < MOST_STEPS:
+        if self.horizon / self.step > MOST_STEPS or self.num_steps < 1:
             raise InputError(
                 f"planner: a horizon of {self.horizon} s has no step of {self.step} s, or more than {MOST_STEPS}"
             )
@@ -99,7 +99,8 @@ def plan(
     previous, elapsed  the last plan on the same line and the time since its start [s]: its rest is a candidate
     all_reasons        judge every candidate, not only those cheaper than the best: for pictures
 
-    Raises InputError for a scene that is not one (shapes, NaN); anything else is answered with a plan."""
+    Raises InputError for a scene that is not one (shapes, NaN, driving backwards), and for a last plan that is none;
+    anything else is answered with a plan."""
     from planning.check_kernel import GOOD, OBSTACLE, ON_LIMITS
 
     check(scene, planner.radius, planner.num_steps)

@@ -41,6 +41,8 @@ class Plan(NamedTuple):
     clear      whether it breaks nothing within the horizon (an emergency stop may, and others who stands)
     cost       of its candidate
     rejected   {reason: how many cheaper candidates were turned down for it} (planning.check_kernel.REASONS)
+               Each counts once: those that touch a road user and a line for the road user or, where all reasons were
+               asked for, for what they touch first.
     candidates that it was chosen from; None where they were let go (a megabyte)
     """
 

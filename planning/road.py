@@ -17,6 +17,7 @@ from planning.reference import ReferenceLine, from_points
 
 Floats = NDArray[np.float64]
 SMOOTH = 6  # points of a lane's middle at least: a quintic
+CROSSED = 0.1  # by which the borders of a lane that opens may cross [m]
 EDGE = 1.0  # between the offsets of borders along a route [m]
 
 
@@ -172,7 +173,7 @@ def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
     Raises InputError for an unknown lane, lanes that do not follow one another, none at all, a speed limit that is no
     positive number, and a left border to the right of the right one."""
     if not isinstance(ids, Sequence) or not ids:
-        raise InputError(f"the route is {ids}; name one or more lanes")
+        raise InputError(f"the route is {ids!r}; give a tuple or list of one or more lanes")
     for a in ids:
         if a not in lanes:
             known = ", ".join(map(repr, list(lanes)[:8])) + (", ..." if len(lanes) > 8 else "")
@@ -202,7 +203,7 @@ def route(lanes: Lanes, ids: Sequence[int], *, std: float = 0.1) -> Route:
             (left if far_left is None else far_left, left, right, right if far_right is None else far_right)
         ):
             edges[here, column] = _offsets(line, border, grid[here])
-        if here.any() and np.median(edges[here, 1] - edges[here, 2]) < 0.0:
+        if here.any() and np.median(edges[here, 1] - edges[here, 2]) < -CROSSED:
             raise InputError(f"lane {a}: its left border lies to the right of its right one; exchange them")
     opposite = np.array([lanes[a].opposite for a in ids])[which]
     speed = np.array([lanes[a].speed for a in ids])

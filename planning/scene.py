@@ -75,8 +75,8 @@ def check(scene: Scene, radius: float, num_steps: int) -> None:
             "choose a longer one"
         )
     for name, value in zip(scene.goal._fields, scene.goal, strict=True):
-        if not (abs(value) < LARGEST or (name == "until" and value == math.inf)):
-            raise InputError(f"the goal {scene.goal} is not finite, or out of this world")
+        if not (isinstance(value, Real) and (abs(value) < LARGEST or (name == "until" and value == math.inf))):
+            raise InputError(f"the goal {scene.goal} is not of numbers, not finite, or out of this world")
     if scene.goal.speed < 0.0:
         raise InputError(f"the goal {scene.goal} has a negative speed; 0 stands still")
     if (
@@ -97,5 +97,5 @@ def check(scene: Scene, radius: float, num_steps: int) -> None:
     for name in ("stop", "stand"):
         value = getattr(scene, name)
         if not isinstance(value, Real) or math.isnan(value):
-            raise InputError(f"scene: {name} is {value}; infinity means none")
+            raise InputError(f"scene: {name} is {value!r}, but must be a number; infinity means none")
     check_obstacles(scene.obstacles, num_steps)

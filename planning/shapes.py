@@ -238,8 +238,8 @@ def boundary(lines: Sequence[ArrayLike], reach: float, *, within: tuple[float, f
 
     if not 0.0 <= reach < math.inf:
         raise InputError(f"boundary lines: reach is {reach}, but must be 0 or more and finite [m]")
-    if within is not None and not np.isfinite(within).all():
-        raise InputError(f"boundary lines: within is {within}, but must be x, y and a radius, all finite [m]")
+    if within is not None and not (np.isfinite(within[:2]).all() and within[2] >= 0.0):
+        raise InputError(f"boundary lines: within is {within}, but must be x, y and a radius of 0 or more [m]")
     parts = [np.zeros((0, 4))]
     for number, line in enumerate(lines):
         points = np.asarray(line, float)

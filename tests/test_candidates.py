@@ -111,6 +111,7 @@ def test_a_motion_by_the_way_costs_what_the_same_motion_in_time_does() -> None:
         (Planner, {"margin": -0.1}, "planner: margin is -0.1"),
         (Planner, {"horizon": 0.01}, "no step of 0.05"),
         (Planner, {"horizon": 1e9}, "more than 10000"),
+        (Planner, {"horizon": 0.025}, "no step of 0.05"),
         (Planner, {"risk": 1.0}, "risk is 1.0"),
     ],
 )

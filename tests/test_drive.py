@@ -207,10 +207,10 @@ def test_a_scene_that_cannot_be_begun_is_refused() -> None:
         drive(scene, lambda *given: lambda *seen: None)  # type: ignore[arg-type, return-value]
     with pytest.raises(InputError, match=r"the driver gave a NoneType; return a mind"):
         drive(scene, lambda *given: None)  # type: ignore[arg-type, return-value]
-    with pytest.raises(InputError, match=r"would have a NoneType planned in; give planning.planner.Scene"):
+    with pytest.raises(InputError, match=r"would have a NoneType planned in; give planning.scene.Scene"):
         drive(scene, lambda *given: lambda *seen: Thought(None))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"horizon is 0.15 s, but must be longer than a cycle"):
-        drive(scene, steady(), Planner(horizon=0.15))
+    with pytest.raises(InputError, match=r"horizon is 0.1 s, but must be a cycle, "):
+        drive(scene, steady(), Planner(horizon=0.1))
     with pytest.raises(InputError, match="seed is -1"):
         drive(scene, steady(), seed=-1)
     with pytest.raises(InputError, match=r"world is 1e\+308 s, but must be a multiple"):

@@ -160,7 +160,7 @@ def test_a_motion_that_forgets_an_entry_is_told() -> None:
             return [(*column, 0.0) for column in super().noise(x, dt, std, ops)]
 
     x, step = np.zeros((1, 4)), np.full((1, 3), 0.1)
-    with pytest.raises(InputError, match=re.escape("Short.move gives 3 values, but must give 4, a tuple of (x, y, vx")):
+    with pytest.raises(InputError, match=re.escape("Short.move gives 3 values, but must give 4: (x, y, vx")):
         move_formula(Short())(x, step)
     with pytest.raises(InputError, match=r"a column of Long.noise gives 5 values, but must give 4"):
         noise_formula(Long())(x, step)

@@ -17,6 +17,7 @@ from models.program import InputError
 from planning.frenet import Pose
 from planning.reference import ReferenceLine
 from planning.road import Lanes, StopPoint, Tracks
+from planning.scene import BACKWARDS
 
 Floats = NDArray[np.float64]
 CAR = (4.6, 1.9)  # length, width [m]
@@ -266,7 +267,7 @@ def check(scene: DriveScene) -> None:
     """Raises InputError for a scene that is none to drive in, with the part, its value and what it must be: how the
     vehicle stands on the map, the route and road users are judged where they are used."""
     where = f"scene {scene.name}"
-    if not scene.ego.speed >= 0.0:
+    if not scene.ego.speed >= -BACKWARDS:
         raise InputError(f"{where}: the vehicle's speed is {scene.ego.speed} m/s, but must be 0 or more")
     if not scene.wanted > 0.0:
         raise InputError(f"{where}: the speed wanted is {scene.wanted} m/s, but must be positive; infinity means any")

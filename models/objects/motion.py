@@ -180,9 +180,10 @@ def _twice_integrated_white(dt: Any, q: Any, ops: Any) -> tuple[Scalars, ...]:
 
 def check_length(what: str, values: Any, names: Sequence[str]) -> None:
     """Raises InputError where what a motion or a sensor gives is not one value for each name."""
-    if not isinstance(values, (tuple, list)) or len(values) != len(names):
-        given = f"{len(values)} values" if isinstance(values, (tuple, list)) else f"a {type(values).__name__}"
-        raise InputError(f"{what} gives {given}, but must give {len(names)}, a tuple of ({', '.join(names)})")
+    if not hasattr(values, "__len__"):
+        raise InputError(f"{what} gives {type(values).__name__}, but must give a tuple of ({', '.join(names)})")
+    if len(values) != len(names):
+        raise InputError(f"{what} gives {len(values)} values, but must give {len(names)}: ({', '.join(names)})")
 
 
 @lru_cache

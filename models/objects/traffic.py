@@ -272,8 +272,8 @@ class Traffic:
         times = np.sort([scan.time for scan in found])
         for late in np.flatnonzero(np.diff(times) > LONGEST_GAP):
             raise InputError(
-                f"the scan at {times[late + 1]} s comes {times[late + 1] - times[late]:g} s after the one before, when "
-                "nobody seen then is left; give times in seconds, or the parts one by one"
+                f"the scan at {times[late + 1]} s comes {times[late + 1] - times[late]:g} s after the one before, more "
+                f"than {LONGEST_GAP:g}; give times in seconds, or the parts one by one"
             )
         return tuple(found)
 

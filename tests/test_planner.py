@@ -206,6 +206,24 @@ def test_in_a_hurry_the_same_candidates_are_good(seed: int) -> None:
     assert {REASONS[r] for r in touching.reason[other]} <= {"other road user"}
 
 
+@pytest.mark.parametrize(
+    ("change", "reason", "stand"),
+    [
+        ({"curvature_rate": 1e-4}, "curvature rate", math.inf),
+        ({"braking": 0.5}, "cannot stop beyond the horizon", 75.0),
+        ({"speed": 9.0}, "speed", math.inf),
+    ],
+)
+def test_what_comfort_alone_forbids_is_tried_again(change: dict[str, float], reason: str, stand: float) -> None:
+    planner = Planner(comfort=Limits(**change))
+    given = scene(START, Keep(10.0), stand=stand)
+    found, made = plan(planner, given), candidates_of(planner, given)
+    assert found.tier == RELAXED and found.rejected[reason] > 0
+    wider = candidates_of(planner, given, both=True)
+    costs = [c.cost[best] for c in (made, wider) if (best := judge(planner, given, c, planner.able).best) >= 0]
+    assert found.cost == min(costs)
+
+
 def test_a_motion_told_as_states_is_judged_like_a_candidate() -> None:
     given = scene(START, Keep(14.0), offsets=np.linspace(-2.0, 3.5, 6), obstacles=rectangle(45.0, 1.0, 3.0, 0.2))
     limits = Limits(speed=12.0, acceleration=2.2, curvature_rate=0.1)

@@ -138,6 +138,16 @@ def cycles(found: Drive) -> list[dict[str, Any]]:
     return rows
 
 
+def touches(found: Drive) -> list[tuple[str, str, str]]:
+    """Who was touched: when first [s], what, and whose fault it is, in words."""
+    from experiments.closed_loop_metrics import contacts
+
+    return [
+        (f"{one.time:.2f}", f"road user {one.actor}" if one.actor >= 0 else "boundary line", one.excuse or "at fault")
+        for one in contacts(found)
+    ]
+
+
 def _plain(value: Any) -> Any:
     value = value.item()
     return round(value, 6) if isinstance(value, float) else value
@@ -152,13 +162,9 @@ def report(
     manifest: dict[str, Any],
 ) -> str:
     """The drive as one page that needs nothing else."""
-    from experiments.closed_loop_metrics import contacts
     from experiments.report import details, failure_boxes, page, scores_table, table
 
-    touched = [
-        (f"{one.time:.2f}", f"road user {one.actor}" if one.actor >= 0 else "boundary line", one.excuse or "at fault")
-        for one in contacts(found)
-    ]
+    touched = touches(found)
     stated = [(f"{at:.2f}", why) for at, why in zip(found.log.cycle, found.log.stated, strict=True) if why]
     thought = [("0.00", found.log.words[0])]
     for at, words in zip(found.log.cycle[1:], found.log.words[1:], strict=True):

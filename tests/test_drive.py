@@ -13,6 +13,7 @@ import pytest
 from experiments.closed_loop import Drive, Loop, Mind, Thought, drive, stop_along
 from experiments.closed_loop_figures import Fan, candidate_handles, colours_of, figures
 from experiments.closed_loop_metrics import contacts, gap_error, metrics, stop_error, violations
+from experiments.drive import touches
 from experiments.driver import by_the_rules
 from experiments.run import check_read
 from experiments.scenarios import driven_roads
@@ -292,12 +293,15 @@ def test_who_drives_into_the_vehicle_from_behind_is_at_fault_himself(actor: Reco
     straight = driven_roads.box(duration=6.0)._replace(boundary=(), actors=(actor,))
     found = drive(straight, steady(10.0))
     assert [(one.actor, not one.excuse) for one in contacts(found)] == ([] if fault is None else [(0, fault)])
+    words = {None: [], False: [("road user 0", "from behind")], True: [("road user 0", "at fault")]}
+    assert [told[1:] for told in touches(found)] == words[fault]
 
 
 def test_touched_walls_and_broken_limits_are_counted() -> None:
     blind = drive(driven_roads.box(duration=3.0), steady(10.0))
     through = blind._replace(log=blind.log._replace(ego=blind.log.ego + np.eye(6)[0] * 8.0))
     assert contacts(blind) == [] and [(one.actor, one.excuse) for one in contacts(through)] == [(-1, "")]
+    assert all(made.candidates is None for made in blind.plans), "they would fill the memory"
     assert metrics(through)["boundary_clearance_m"] == 0.0
     quick = drive(driven_roads.follow(duration=3.0)._replace(actors=()), steady(9.0))
     assert not violations(quick).any()

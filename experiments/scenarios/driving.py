@@ -31,10 +31,9 @@ class Body(NamedTuple):
     size: tuple[float, float]
 
 
-def _check_finite(who: str, **values: float) -> None:
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise InputError(f"{who}: {name} is {value}, but must be finite")
+def _check_start(who: str, start: float) -> None:
+    if not math.isfinite(start):
+        raise InputError(f"{who}: start is {start}, but must be finite")
 
 
 def _check_size(who: str, size: tuple[float, float]) -> None:
@@ -77,7 +76,7 @@ class Scripted:
     there: tuple[float, float] = (0.0, math.inf)
 
     def __post_init__(self) -> None:
-        _check_finite("a scripted road user", start=self.start)
+        _check_start("a scripted road user", self.start)
         for name, told in (("speed", self.speed), ("offset", self.offset)):
             table = np.asarray(told, float)
             if table.ndim != 2 or table.shape[1] != 2 or not np.isfinite(table).all():
@@ -178,7 +177,7 @@ class Reacting:
 
     def __post_init__(self) -> None:
         who = "a reacting road user"
-        _check_finite(who, start=self.start)
+        _check_start(who, self.start)
         for name in ("wanted", "acceleration", "braking"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{who}: {name} is {getattr(self, name)}, but must be positive and finite")
